@@ -1,0 +1,40 @@
+"""Errors meant for the person at the prompt: one line that says what, where, what was found, and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class HudepthError(Exception):
+    """Base of all errors that the command line prints as one line, without a traceback."""
+
+
+class ConfigError(HudepthError):
+    """A configuration that cannot be run."""
+
+
+class DataError(HudepthError):
+    """A data set, a file in it, or a split that cannot be used."""
+
+
+class CheckpointError(HudepthError):
+    """A checkpoint that cannot be read, is not trusted, or does not fit."""
+
+
+class TrainingError(HudepthError):
+    """Training that cannot go on, for example because its loss is not finite."""
+
+
+def did_you_mean(name: str, choices: Iterable[str]) -> str:
+    """Return ``" Did you mean 'x'?"`` for the choice closest to ``name``, or an empty string if none is close.
+
+    Dotted names are compared as a whole and by their last part, so that ``model.headz`` finds
+    ``model.attention_heads``' neighbours as well as keys that were moved to another group.
+    """
+    known = list(choices)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    if not close:
+        last = {choice.rsplit(".", 1)[-1]: choice for choice in known}
+        close = [last[match] for match in difflib.get_close_matches(name.rsplit(".", 1)[-1], last, n=1, cutoff=0.6)]
+    return f" Did you mean '{close[0]}'?" if close else ""

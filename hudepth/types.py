@@ -1,0 +1,45 @@
+"""Names and shapes of what flows through hudepth."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, NotRequired, TypedDict
+
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
+from torch import Tensor
+
+
+class RawBatch(TypedDict):
+    """What the loader reads from the depth store, before it is moved to a device."""
+
+    image: UInt8[Tensor, "b h w 3"]
+    """RGB."""
+    depth_mm: UInt16[Tensor, "b h w"]
+    """Millimetres, 0 where unmeasured."""
+    index: Int[Tensor, " b"]
+    """Position in the depth store."""
+    native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]
+    """Test batches only: truth at its native resolution [m], 0 where unmeasured."""
+
+
+class Batch(TypedDict):
+    """What the network, the losses and the metrics see."""
+
+    image: Float[Tensor, "b 3 h w"]
+    """RGB, normalised with ImageNet's mean and standard deviation."""
+    unit_depth: Float[Tensor, "b 1 h w"]
+    """Depth clipped to ``max_depth_m`` and divided by it, in [0, 1]; 0 where unmeasured."""
+    valid: Bool[Tensor, "b 1 h w"]
+    """True where the truth is measured."""
+    index: Int[Tensor, " b"]
+    """Position in the depth store."""
+    native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]
+    """Test batches only: truth at its native resolution [m], 0 where unmeasured."""
+
+
+class LossTerms(NamedTuple):
+    """A loss and what it consists of."""
+
+    total: Float[Tensor, ""]
+    """What is minimised: the weighted sum."""
+    terms: dict[str, Float[Tensor, ""]]
+    """Each term by name, before its weight."""
