@@ -1,0 +1,8 @@
+"""Training losses: all take (pred, target, image, valid) and return :class:`hudepth.types.LossTerms`."""
+
+from __future__ import annotations
+
+from hudepth.losses.badcl import BADCL
+from hudepth.losses.baselines import L1, L2, BerHu, SILog
+
+__all__ = ["BADCL", "L1", "L2", "BerHu", "SILog"]

@@ -1,0 +1,6 @@
+"""Networks from a normalised RGB image to unit depth."""
+
+from hudepth.models.hybrid_unet import HybridUNet
+from hudepth.models.tiny import TinyUNet
+
+__all__ = ["HybridUNet", "TinyUNet"]

@@ -1,0 +1,196 @@
+"""What happens beside training: history, one line an epoch, pictures, checkpoints."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import nn
+from torch.utils.data import DataLoader
+
+from hudepth import run_dir
+from hudepth.console import console, duration, log
+from hudepth.data.datamodule import preprocess
+from hudepth.data.dataset import StoreDataset, as_is
+from hudepth.data.store import DepthStore
+from hudepth.files import write_text
+from hudepth.viz.panels import Panel, draw_panels, save_panels
+
+
+def epoch_metrics(trainer: Trainer) -> dict[str, float]:
+    """Return what was logged for the epoch that ends now, by name."""
+    return {name: value.item() for name, value in sorted(trainer.callback_metrics.items())}
+
+
+class History(Callback):
+    """Writes metrics.csv, one row an epoch, and keeps the rows in every checkpoint.
+
+    A resumed run writes the file anew from its checkpoint, so the history goes on exactly where the weights do,
+    whatever a killed run left in the file.
+
+    Args:
+        path: the file to write.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[dict[str, float]] = []
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Add the epoch's row. Checkpoints are saved after this, so that they hold it."""
+        row = {"epoch": float(trainer.current_epoch + 1), "step": float(trainer.global_step), **epoch_metrics(trainer)}
+        self.rows.append(row)
+        if trainer.is_global_zero:
+            self._write()
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the rows a checkpoint brought."""
+        if self.rows and trainer.is_global_zero:
+            self._write()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the rows, for the checkpoint."""
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the rows from a checkpoint."""
+        self.rows = [dict(row) for row in state_dict["rows"]]
+
+    def _write(self) -> None:
+        text = io.StringIO()
+        names = list(dict.fromkeys(name for row in self.rows for name in row))
+        writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+        writer.writeheader()
+        for row in self.rows:
+            writer.writerow({name: int(v) if name in ("epoch", "step") else repr(v) for name, v in row.items()})
+        write_text(self.path, text.getvalue())
+
+
+class EpochLine(Callback):
+    """Logs one line an epoch: losses, metrics, time taken and time left.
+
+    Args:
+        monitor: the metric that decides which checkpoint is best, shown first.
+    """
+
+    SHOWN = ("val/abs_rel", "val/rmse", "val/delta1")
+
+    def __init__(self, monitor: str) -> None:
+        self.shown = tuple(dict.fromkeys((monitor, *self.SHOWN)))
+        self._start = 0.0
+        self._first = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remember when training began, or went on."""
+        self._start, self._first = time.monotonic(), trainer.current_epoch
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the line."""
+        if not trainer.is_global_zero:
+            return
+        metrics = epoch_metrics(trainer)
+        done = trainer.current_epoch + 1 - self._first
+        each = (time.monotonic() - self._start) / done
+        left = max(0, (trainer.max_epochs or 0) - trainer.current_epoch - 1)
+        values = [f"{name} {metrics[name]:.4f}" for name in ("train/total", "val/total", *self.shown) if name in metrics]
+        ending = f"{duration(each)} an epoch" + (f", {duration(each * left)} left" if left else "")
+        log.info("epoch %d of %s: %s (%s)", trainer.current_epoch + 1, trainer.max_epochs, ", ".join(values), ending)
+
+
+class PanelPictures(Callback):
+    """Draws RGB, truth, prediction and error of the same validation pairs each time.
+
+    Args:
+        folder: where ``epoch_<n>.png`` goes.
+        store: holds the pairs.
+        indices: which of them, as positions in the store.
+        every_n_epochs: how often; the last epoch is always drawn.
+        max_depth_m: what unit depth 1 stands for.
+    """
+
+    def __init__(
+        self, folder: Path, store: DepthStore, indices: Sequence[int], *, every_n_epochs: int, max_depth_m: float
+    ) -> None:
+        self.folder, self.store, self.indices = folder, store, list(indices)
+        self.every_n_epochs, self.max_depth_m = every_n_epochs, max_depth_m
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw, if it is time."""
+        epoch = trainer.current_epoch + 1
+        due = epoch % self.every_n_epochs == 0 or epoch == trainer.max_epochs
+        if trainer.sanity_checking or not trainer.is_global_zero or not due:
+            return
+        panels = make_panels(pl_module, self.store, self.indices, max_depth_m=self.max_depth_m)
+        save_panels(self.folder / f"epoch_{epoch:03d}.png", panels)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                picture = draw_panels(panels)
+                logger.experiment.add_image("val/panels", picture, trainer.global_step, dataformats="HWC")
+
+
+@torch.inference_mode()
+def make_panels(
+    module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float
+) -> list[Panel]:
+    """Predict some pairs of a store and return them as rows of a picture.
+
+    Args:
+        module: normalised image to unit depth.
+        store: holds the pairs.
+        indices: which of them.
+        max_depth_m: what unit depth 1 stands for.
+    """
+    panels = []
+    was_training = module.training
+    module.eval()
+    device = next(module.parameters()).device
+    for raw in DataLoader(StoreDataset(store, indices), batch_size=1, collate_fn=as_is):
+        batch = preprocess(raw, max_depth_m=max_depth_m)
+        pred_m = module(batch["image"].to(device)).float().cpu()[0, 0] * max_depth_m
+        truth_m = np.minimum(raw["depth_mm"][0].numpy() / np.float32(1000), np.float32(max_depth_m))
+        record = store.records[int(raw["index"][0])]
+        panels.append(Panel(raw["image"][0].numpy(), truth_m, pred_m.numpy(), title=record.id))
+    module.train(was_training)
+    return panels
+
+
+def evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
+    """Pick ``count`` of ``indices`` (all, if there are fewer), evenly spaced, always the same."""
+    count = min(count, len(indices))
+    return [indices[i * len(indices) // count] for i in range(count)]
+
+
+def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelCheckpoint]:
+    """Return the callbacks that keep the best weights and the last state.
+
+    ``best.ckpt`` holds weights only; ``last.ckpt`` all that resuming needs. The last is saved last, so that it knows
+    of the best.
+
+    Args:
+        run: the run directory.
+        monitor: what the best is judged by.
+        mode: ``min`` or ``max``.
+    """
+    folder = run / run_dir.CHECKPOINTS
+    best = ModelCheckpoint(
+        folder, filename=Path(run_dir.BEST).stem, monitor=monitor, mode=mode, save_weights_only=True,
+        save_on_train_epoch_end=True, enable_version_counter=False, auto_insert_metric_name=False,
+    )  # fmt: skip
+    last = ModelCheckpoint(
+        folder, filename=Path(run_dir.LAST).stem, save_on_train_epoch_end=True, enable_version_counter=False
+    )
+    return [best, last]
+
+
+def shows_progress() -> bool:
+    """Whether a live progress bar makes sense here."""
+    return console.is_terminal

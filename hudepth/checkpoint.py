@@ -1,0 +1,166 @@
+"""Checkpoints: plain tensors, numbers, strings, lists and dicts, written whole and read without running code."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from torch import Tensor, nn
+
+from hudepth import run_dir
+from hudepth.errors import CheckpointError, TrainingError
+from hudepth.files import written_whole
+from hudepth.instantiate import instantiate
+
+KEY = "hudepth"
+"""Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""
+VERSION = 1
+NET_PREFIX = "net."
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint beside its place and renames it, so that a full disk or a kill never costs the previous one."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write ``checkpoint`` to ``path``, whole or not at all.
+
+        Raises:
+            TrainingError: if the disk is full or the folder cannot be written; the previous checkpoint is intact.
+        """
+        try:
+            with written_whole(Path(path)) as part:
+                torch.save(checkpoint, part)
+        except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
+            raise TrainingError(
+                f"the checkpoint '{path}' could not be saved ({_first_line(error)}). The previous one is intact: "
+                f"make space, then continue with hudepth-train resume={Path(path).parent.parent}"
+            ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint, read and checked but not yet built into a network."""
+
+    path: Path
+    run: Path | None
+    """The run directory it lies in, None if it was moved elsewhere."""
+    config: dict[str, Any]
+    """The run's resolved configuration."""
+    split: dict[str, Any]
+    """Summary of the split it was trained on."""
+    epoch: int
+    """Finished epochs."""
+    state: dict[str, Tensor]
+    """The network's tensors."""
+
+    def build_net(self, *, trust: list[str]) -> nn.Module:
+        """Return the network in evaluation mode.
+
+        It is laid out without memory and then given the checkpoint's tensors, so that a configuration which asks for
+        more than the file holds is an error and not an exhausted machine.
+
+        Args:
+            trust: further modules whose classes the configuration may name.
+
+        Raises:
+            CheckpointError: if the tensors are not those of the configured network.
+            ConfigError: if the configuration names something that is not trusted.
+        """
+        model = dict(self.config["model"])
+        if "weights" in model:
+            model["weights"] = None  # the trunk's start does not matter any more
+        with torch.device("meta"):
+            net: nn.Module = instantiate(model, trust=trust)
+        try:
+            net.load_state_dict(self.state, assign=True)
+        except RuntimeError as error:
+            own = net.state_dict()
+            unlike = [n for n in {**own, **self.state} if n not in own or n not in self.state or own[n].shape != self.state[n].shape]
+            raise CheckpointError(
+                f"'{self.path}' is from another model: {len(unlike)} tensors do not fit {model.get('_target_')}, "
+                f"the first is '{unlike[0] if unlike else '?'}'. Pass a checkpoint whose configuration matches its weights."
+            ) from error
+        return net.eval()
+
+
+def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
+    """Return the file that ``spec`` means.
+
+    Args:
+        spec: a file; a run directory (its best checkpoint, else its last); or ``last`` (the newest run).
+        runs: where ``last`` looks.
+
+    Raises:
+        CheckpointError: if there is no such file.
+    """
+    path = run_dir.newest_run(runs) if spec == "last" else Path(spec).expanduser()
+    if path.is_dir():
+        folder = path / run_dir.CHECKPOINTS
+        for name in (run_dir.BEST, run_dir.LAST):
+            if (folder / name).is_file():
+                return folder / name
+        raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint; its first epoch was never finished.")
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint: no file or run directory '{path}'. Pass a file, a run directory, or last.")
+    return path
+
+
+def read_plain(path: Path) -> dict[str, Any]:
+    """Read a file of plain types; anything else in it is refused unread.
+
+    Raises:
+        CheckpointError: if the file is damaged, or holds code.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"'{path}' is refused: it holds more than tensors and plain values, so loading it could run code. "
+            "Use a checkpoint written by hudepth-train."
+        ) from error
+    except Exception as error:
+        raise CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)}).") from error
+    if not isinstance(content, dict):
+        raise CheckpointError(f"'{path}' holds no checkpoint, but a {type(content).__name__}.")
+    return content
+
+
+def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
+    """Find and read a checkpoint.
+
+    Args:
+        spec: a file, a run directory, or ``last``.
+        runs: where ``last`` looks.
+
+    Raises:
+        CheckpointError: if it is missing, damaged, holds code, or was not written by hudepth.
+    """
+    path = find_checkpoint(spec, runs=runs)
+    content = read_plain(path)
+    own = content.get(KEY)
+    if not isinstance(own, dict) or "state_dict" not in content:
+        raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
+    if own.get("version") != VERSION:
+        raise CheckpointError(f"'{path}' has checkpoint version {own.get('version')}; this hudepth reads {VERSION}.")
+    state = {
+        name.removeprefix(NET_PREFIX): value
+        for name, value in content["state_dict"].items()
+        if name.startswith(NET_PREFIX)
+    }
+    return Checkpoint(
+        path=path,
+        run=run_dir.run_of(path.resolve()),
+        config=own["config"],
+        split=own["split"],
+        epoch=int(content.get("epoch", -1)) + 1,
+        state=state,
+    )
+

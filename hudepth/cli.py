@@ -1,0 +1,194 @@
+"""The console scripts. Nothing heavy is imported before Hydra has understood the command line."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from hudepth.errors import ConfigError, HudepthError, did_you_mean
+
+ADDED_GROUPS = ("experiment", "sweep")
+"""Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
+
+DATA_VERBS = ("prepare", "info")
+
+
+def train() -> int:
+    """Run ``hudepth-train``."""
+    return _main("train")
+
+
+def test() -> int:
+    """Run ``hudepth-test``."""
+    return _main("test")
+
+
+def data() -> int:
+    """Run ``hudepth-data``."""
+    return _main("data")
+
+
+def _main(task: str) -> int:
+    """Run one task with the arguments of this process; return its exit code."""
+    arguments = sys.argv[1:]
+    if any(argument in ("-h", "--help") for argument in arguments):
+        from hudepth.help import help_text
+
+        print(help_text(task))
+        return 0
+    if arguments == ["--version"]:
+        from hudepth import __version__
+
+        print(f"hudepth {__version__}")
+        return 0
+    debug = [argument for argument in arguments if argument in ("debug=true", "debug=false")]
+    try:
+        sys.argv[1:] = rewrite(task, [argument for argument in arguments if argument not in debug])
+        return _run_hydra(task)
+    except KeyboardInterrupt:
+        return 130
+    except SystemExit as error:
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    except Exception as error:
+        if "debug=true" in debug:
+            raise
+        print(f"hudepth-{task}: {one_line(error, task)}", file=sys.stderr)
+        return 1
+
+
+def rewrite(task: str, arguments: list[str]) -> list[str]:
+    """Turn what people type into what Hydra expects.
+
+    ``experiment=x`` becomes ``+experiment=x``; ``hudepth-data prepare`` becomes ``verb=prepare``; in ``hudepth-test`` a
+    ``data.root=x`` without ``data=`` becomes ``++data.root=x``, since the rest of ``data`` is in the checkpoint.
+
+    Args:
+        task: train, test or data.
+        arguments: without the program's name.
+
+    Raises:
+        ConfigError: if ``hudepth-data`` is given no verb.
+    """
+    result = [f"+{a}" if a.startswith(tuple(f"{g}=" for g in ADDED_GROUPS)) else a for a in arguments]
+    if task == "data" and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
+        verbs = [a for a in result if a in DATA_VERBS]
+        words = [a for a in result if "=" not in a and not a.startswith("-")]
+        if not verbs:
+            got = f" no verb '{words[0]}'.{did_you_mean(words[0], DATA_VERBS)}" if words else " a verb is missing."
+            raise ConfigError(f"{got.strip()} Type hudepth-data prepare or hudepth-data info.")
+        result = [f"verb={a}" if a == verbs[0] else a for a in result]
+    if task == "test" and not any(a.startswith(("data=", "+data=")) for a in result):
+        result = [f"++{a}" if a.startswith("data.") else a for a in result]
+    return result
+
+
+def _run_hydra(task: str) -> int:
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing; one_line() words the error
+    import hydra
+
+    failures: list[str] = []
+
+    def job(cfg: Any) -> Any:
+        from hydra.core.hydra_config import HydraConfig
+        from hydra.types import RunMode
+
+        from hudepth.console import setup_logging
+
+        setup_logging()
+        run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.tasks.{task}"), task)
+        try:
+            return run(cfg)
+        except Exception as error:
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                raise
+            # The other jobs of a sweep go on; what failed is said at once, and again at the end.
+            failures.append(f"job {HydraConfig.get().job.num}: {one_line(error, task)}")
+            print(f"hudepth-{task}: {failures[-1]}", file=sys.stderr)
+            return None
+
+    hydra.main(config_path="pkg://hudepth.conf", config_name=task, version_base="1.3")(job)()
+    if failures:
+        print(f"hudepth-{task}: {len(failures)} jobs failed:", *failures, sep="\n  ", file=sys.stderr)
+    return 1 if failures else 0
+
+
+def one_line(error: BaseException, task: str) -> str:
+    """Say an error in one line that names the mend.
+
+    Args:
+        error: whatever was raised.
+        task: train, test or data: whose configuration names are suggested.
+    """
+    chain = list(_chain(error))
+    for cause in chain:
+        if isinstance(cause, HudepthError):
+            return " ".join(str(cause).split())
+    for cause in chain:
+        if line := _config_line(cause, task):
+            return line
+    message = " ".join(str(error).split()) or type(error).__name__
+    return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _config_line(error: BaseException, task: str) -> str | None:
+    """Word the errors of Hydra and OmegaConf, with suggestions."""
+    module = type(error).__module__.partition(".")[0]
+    if module not in ("hydra", "omegaconf", "antlr4"):
+        return None
+    text = str(error)
+    if found := re.search(r"Could not find '([^']+)'", text):
+        group, _, name = found[1].rpartition("/")
+        options = options_of(group)
+        if options:
+            return f"{group}: no '{name}'.{did_you_mean(name, options)} Pass one of {', '.join(options)}."
+    if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
+        key = found[1] or getattr(error, "full_key", None) or found[2]
+        return f"no key '{key}'.{did_you_mean(key, known_keys(task))} See hudepth-{task} --cfg job for all keys."
+    if "Could not override" in text or "missing from config" in text.lower():
+        return " ".join(text.split())
+    if "LexerNoViableAlt" in text or "mismatched input" in text or "extraneous input" in text or "no viable alternative" in text:
+        return f"cannot read the command line: {text.splitlines()[0]} Quote values with special characters: 'key=\"a b\"'."
+    return " ".join(text.split())
+
+
+def conf_folder() -> Path:
+    """Return the folder of the configuration tree."""
+    import hudepth.conf
+
+    return Path(str(hudepth.conf.__file__)).parent
+
+
+def options_of(group: str) -> list[str]:
+    """Return the choices of a group of the configuration, for example ``data``."""
+    return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml") if path.stem != "base")
+
+
+def known_keys(task: str) -> list[str]:
+    """Return all dotted keys and groups that the task's configuration has by default."""
+    from hydra import compose, initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import OmegaConf
+
+    GlobalHydra.instance().clear()
+    with initialize_config_module("hudepth.conf", version_base="1.3"):
+        config = OmegaConf.to_container(compose(task), resolve=False)
+    keys = list(_dotted(config))
+    return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
+
+
+def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
+    for key, value in config.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _dotted(value, f"{prefix}{key}.")

@@ -1,0 +1,59 @@
+"""What people see: log lines, progress on long work, tables."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+T = TypeVar("T")
+
+console = Console(stderr=True)
+"""Progress and log lines; results go to standard output."""
+
+log = logging.getLogger("hudepth")
+
+
+def setup_logging() -> None:
+    """Send hudepth's log lines to standard error, once."""
+    if not log.handlers:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+        log.propagate = False
+
+
+def track(items: Iterable[T], *, total: int, what: str) -> Iterator[T]:
+    """Yield ``items`` under a progress bar; where there is no terminal, as a line every ten seconds.
+
+    Args:
+        items: what to go through.
+        total: how many there are.
+        what: shown before the bar, for example ``preparing nyu_labeled``.
+    """
+    if console.is_terminal:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True) as progress:
+            yield from progress.track(items, total=total, description=what)
+        return
+    start = last = time.monotonic()
+    for done, item in enumerate(items, start=1):
+        yield item
+        now = time.monotonic()
+        if now - last > 10:
+            last = now
+            log.info("%s: %d of %d, %s left", what, done, total, duration((now - start) / done * (total - done)))
+
+
+def duration(seconds: float) -> str:
+    """Spell a time span: ``48 s``, ``12 min``, ``3 h 05 min``."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"

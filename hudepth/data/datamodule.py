@@ -1,0 +1,168 @@
+"""From a source to batches: prepares the store once, splits it, loads it, normalises it on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningDataModule
+from torch.utils.data import DataLoader, DistributedSampler
+
+from hudepth.data.dataset import ShardSampler, StoreDataset, as_is
+from hudepth.data.prepare import prepare
+from hudepth.data.sources.base import Source
+from hudepth.data.splits import Split, make_split
+from hudepth.data.store import DepthStore
+from hudepth.errors import ConfigError
+from hudepth.normalise import normalise_image
+from hudepth.types import Batch, RawBatch
+
+
+class DepthDataModule(LightningDataModule):
+    """Batches of image, unit depth and valid mask for training, validation and test.
+
+    Args:
+        source: where the pairs come from.
+        size: (height, width) of training images; the paper's is 224 x 224.
+        split: ``random`` (the paper), ``scene`` or ``official``; see :func:`hudepth.data.splits.make_split`.
+        split_seed: seed of the split (the paper: 42).
+        fractions: of train, val and test (the paper: 70 / 10 / 20 %).
+        max_depth_m: depth is clipped to it and divided by it (the paper: 10 m).
+        batch_size: pairs per step (the paper: 8).
+        num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
+        seed: of the order of training pairs, which depends on nothing but this and the epoch.
+        cache: folder of the depth stores.
+        native: keep native-resolution truth in the store, for protocols like ``eigen``.
+        on_error: ``raise`` at a bad pair or ``skip`` it.
+        prepare_workers: processes that prepare the store; default one per core.
+
+    Raises:
+        ConfigError: for values out of range.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        size: Sequence[int] = (224, 224),
+        split: str = "random",
+        split_seed: int = 42,
+        fractions: Sequence[float] = (0.7, 0.1, 0.2),
+        max_depth_m: float = 10.0,
+        batch_size: int = 8,
+        num_workers: int = 0,
+        seed: int = 42,
+        cache: str | Path = "~/.cache/hudepth",
+        native: bool = True,
+        on_error: str = "raise",
+        prepare_workers: int | None = None,
+    ) -> None:
+        super().__init__()
+        if len(size) != 2 or min(size) < 1:
+            raise ConfigError(f"data.size: {list(size)} is not [height,width]. Pass data.size=[224,224].")
+        if batch_size < 1:
+            raise ConfigError(f"data.batch_size: {batch_size} is less than 1.")
+        if max_depth_m <= 0:
+            raise ConfigError(f"data.max_depth_m: {max_depth_m} is not a positive number of metres.")
+        self.source = source
+        self.size = (int(size[0]), int(size[1]))
+        self.split_kind, self.split_seed, self.fractions = split, split_seed, tuple(fractions)
+        self.max_depth_m = float(max_depth_m)
+        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.cache, self.native = Path(cache), native
+        self.on_error, self.prepare_workers = on_error, prepare_workers
+        self._store: DepthStore | None = None
+        self._split: Split | None = None
+
+    @property
+    def store(self) -> DepthStore:
+        """The depth store, prepared if need be."""
+        if self._store is None:
+            self._store = prepare(
+                self.source,
+                size=self.size,
+                cache=self.cache,
+                native=self.native,
+                on_error=self.on_error,
+                workers=self.prepare_workers,
+            )
+        return self._store
+
+    @property
+    def split(self) -> Split:
+        """Which pairs of the store train, validate and test; assign to use one read from a split.json."""
+        if self._split is None:
+            self._split = make_split(
+                self.store.records, kind=self.split_kind, seed=self.split_seed, fractions=self.fractions
+            )
+        return self._split
+
+    @split.setter
+    def split(self, split: Split) -> None:
+        self._split = split
+
+    def prepare_data(self) -> None:
+        """Build the depth store, once."""
+        _ = self.store
+
+    def train_dataloader(self) -> DataLoader[RawBatch]:
+        """Shuffled training batches; the last, shorter one is kept."""
+        rank, world_size = self._shard()
+        dataset = StoreDataset(self.store, self.split.train)
+        # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees what it would have seen.
+        sampler: DistributedSampler[int] = DistributedSampler(
+            dataset, num_replicas=world_size, rank=rank, shuffle=True, seed=self.seed
+        )
+        return self._loader(dataset, sampler)
+
+    def val_dataloader(self) -> DataLoader[RawBatch]:
+        """Validation batches, in the store's order."""
+        return self._evaluation_loader(StoreDataset(self.store, self.split.val))
+
+    def test_dataloader(self) -> DataLoader[RawBatch]:
+        """Test batches, in the split's order, with native-resolution truth where the store has it."""
+        return self._evaluation_loader(StoreDataset(self.store, self.split.test, native=self.store.has_native))
+
+    def on_after_batch_transfer(self, batch: RawBatch, dataloader_idx: int) -> Batch:
+        """Normalise on the device, which spares the transfer three quarters of its bytes."""
+        return preprocess(batch, max_depth_m=self.max_depth_m)
+
+    def _evaluation_loader(self, dataset: StoreDataset) -> DataLoader[RawBatch]:
+        rank, world_size = self._shard()
+        return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size))
+
+    def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            sampler=sampler,
+            num_workers=self.num_workers,
+            collate_fn=as_is,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.num_workers > 0,
+        )
+
+    def _shard(self) -> tuple[int, int]:
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+
+def preprocess(batch: RawBatch, *, max_depth_m: float) -> Batch:
+    """Normalise what the loader read: ImageNet statistics for the image; depth clipped, divided, masked.
+
+    Args:
+        batch: RGB bytes and millimetres.
+        max_depth_m: depth is clipped to it and divided by it.
+    """
+    image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format)
+    depth_mm = batch["depth_mm"].to(torch.float32)[:, None]
+    result = Batch(
+        image=normalise_image(image / 255),
+        unit_depth=(depth_mm / (1000 * max_depth_m)).clamp_(max=1),
+        valid=depth_mm > 0,
+        index=batch["index"],
+    )
+    if "native_depth" in batch:
+        result["native_depth"] = batch["native_depth"]
+    return result

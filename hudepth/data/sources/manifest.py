@@ -1,0 +1,188 @@
+"""Pairs listed in a CSV file, and the labelled NYU set kept that way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from hudepth.data.encoding import check_encoding
+from hudepth.data.sources.base import RawPair, Record, Source, existing_root
+from hudepth.data.sources.files import csv_rows, inside, read_bytes, read_pair
+from hudepth.errors import DataError
+
+_REQUIRED = ("image", "depth")
+_SPLITS = ("", "train", "test")
+
+
+class ManifestSource(Source):
+    """Any set of pairs with a list: one CSV file beside the data, one line a pair, a header line first.
+
+    ================= ========================================================================================
+    column            content
+    ================= ========================================================================================
+    image             JPEG or PNG, a path relative to the folder of the data
+    depth             PNG of 8 or 16 bits, ``.npy`` or TIFF, likewise
+    id or index       optional, unique; the image's path without extension if there is neither
+    scene             optional; frames of a scene belong together
+    frame             optional whole number; position within the scene, by default in order of the list
+    split             optional: ``train``, ``test`` or empty
+    category          optional: kind of scene
+    depth_scale_m     optional [m]: depth = (value + depth_offset) * depth_scale_m, see ``linear`` in
+                      :func:`hudepth.data.encoding.to_metres`
+    depth_offset      optional, in units of the stored value; 0 where empty
+    ================= ========================================================================================
+
+    Paths must stay inside the folder.
+
+    Args:
+        root: the folder, or the CSV file itself.
+        manifest: name of the CSV file within the folder.
+        encoding: how depth values become metres.
+        indoor: whether the set shows rooms, for the check of its depth range.
+    """
+
+    name: ClassVar[str] = "manifest"
+
+    def __init__(
+        self,
+        root: str | Path | None,
+        *,
+        manifest: str = "index.csv",
+        encoding: str = "auto",
+        indoor: bool = True,
+    ) -> None:
+        self.root = root
+        self.manifest = manifest
+        self.encoding = encoding
+        self.indoor = indoor
+
+    def records(self) -> Sequence[Record]:
+        """List the pairs in order of the CSV file.
+
+        Raises:
+            ConfigError: if the encoding is unknown.
+            DataError: if the file is missing, empty or malformed, or a path leaves the folder.
+        """
+        check_encoding(self.encoding)
+        folder, index = self._place()
+        rows = csv_rows(read_bytes(index), where=f"'{index}'")
+        header = [cell.strip() for cell in rows[0][1]] if rows else []
+        if missing := [column for column in _REQUIRED if column not in header]:
+            raise DataError(
+                f"'{index}': no column {' and '.join(missing)}, found {', '.join(header) or 'nothing'}. "
+                "Name the columns in its first line."
+            )
+        records: list[Record] = []
+        lines: dict[str, int] = {}
+        frames: dict[str, int] = {}
+        for line, cells in rows[1:]:
+            where = f"'{index}' line {line}"
+            if len(cells) != len(header):
+                raise DataError(f"{where}: {len(cells)} cells for {len(header)} columns. Complete the line.")
+            row = {column: cell.strip() for column, cell in zip(header, cells, strict=True)}
+            record = self._record(row, folder, frames, where)
+            if record.id in lines:
+                raise DataError(
+                    f"{where}: id '{record.id}' is taken by line {lines[record.id]}. Make ids unique."
+                )
+            lines[record.id] = line
+            records.append(record)
+        if not records:
+            raise DataError(f"'{index}': lists no pairs. Add a line for each pair.")
+        return records
+
+    def read(self, record: Record) -> RawPair:
+        """Decode one pair.
+
+        Raises:
+            DataError: if a file is missing, outside the folder, truncated, or the two differ in size.
+        """
+        folder, index = self._place()
+        image, depth = (inside(folder, name, where=f"'{index}'") for name in (record.image, record.depth))
+        return read_pair(image, depth)
+
+    def files(self) -> Sequence[Path]:
+        """Return the list and every file on it.
+
+        Raises:
+            DataError: as :meth:`records`.
+        """
+        folder, index = self._place()
+        return [index, *(folder / name for record in self.records() for name in (record.image, record.depth))]
+
+    def _place(self) -> tuple[Path, Path]:
+        root = existing_root(self.root, expects=f"folder with {self.manifest}")
+        if root.is_file():
+            return root.parent, root
+        index = root / self.manifest
+        if not index.is_file():
+            raise DataError(
+                f"data.root: no file '{self.manifest}' in '{root}'. "
+                f"Pass data.root=<folder with {self.manifest}>, or run with data=rooms."
+            )
+        return root, index
+
+    def _record(self, row: Mapping[str, str], folder: Path, frames: dict[str, int], where: str) -> Record:
+        for column in _REQUIRED:
+            inside(folder, row[column], where=where)
+        scene, split = row.get("scene", ""), row.get("split", "")
+        if split not in _SPLITS:
+            raise DataError(f"{where}: unknown split '{split}'. Write train, test, or nothing.")
+        frames[scene] = frames.get(scene, -1) + 1
+        scale_m = _number(row, "depth_scale_m", where)
+        if scale_m is not None and scale_m <= 0:
+            raise DataError(f"{where}: depth_scale_m is {scale_m:g}. Write a positive number of metres.")
+        return Record(
+            id=self._row_id(row),
+            scene=scene,
+            frame=_whole(row, "frame", where, otherwise=frames[scene]),
+            split=split,
+            category=row.get("category", ""),
+            image=row["image"],
+            depth=row["depth"],
+            depth_scale_m=scale_m,
+            depth_offset=_number(row, "depth_offset", where) or 0.0,
+        )
+
+    def _row_id(self, row: Mapping[str, str]) -> str:
+        return row.get("id") or row.get("index") or str(Path(row["image"]).with_suffix("").as_posix())
+
+
+class NyuLabeledSource(ManifestSource):
+    """The labelled NYU Depth V2 set as single files: labelled set, 8-bit depth with one scale per image.
+
+    1449 pairs of 640 x 480 from 464 scenes, official split of 795 training and 654 test frames (Silberman,
+    Hoiem, Kohli and Fergus, ECCV 2012). ``NNNNN.jpg`` is the image and ``NNNNN.png`` the in-painted depth
+    in 8 bits; each line of ``index.csv`` gives the scale and offset that make metres of it, in steps of 5
+    to 39 mm. Columns as :class:`ManifestSource`, with ``index`` counted from 0; it is padded to five digits
+    to give the id.
+    """
+
+    name: ClassVar[str] = "nyu_labeled"
+
+    def _row_id(self, row: Mapping[str, str]) -> str:
+        return super()._row_id(row).zfill(5)
+
+
+def _number(row: Mapping[str, str], column: str, where: str) -> float | None:
+    text = row.get(column, "")
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise DataError(f"{where}: {column} is '{text}'. Write a finite number, or leave the cell empty.")
+    return value
+
+
+def _whole(row: Mapping[str, str], column: str, where: str, *, otherwise: int) -> int:
+    text = row.get(column, "")
+    if not text:
+        return otherwise
+    if not (text.isascii() and text.isdigit() and len(text) < 19):
+        raise DataError(f"{where}: {column} is '{text}'. Write a whole number, or leave the cell empty.")
+    return int(text)

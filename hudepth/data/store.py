@@ -1,0 +1,187 @@
+"""The depth store: one HDF5 file that holds a prepared data set, whatever form it came in.
+
+======================  ===================  ==========================================================
+data set                dtype, shape         meaning
+======================  ===================  ==========================================================
+image                   uint8 [n, h, w, 3]   RGB at training size
+depth_mm                uint16 [n, h, w]     millimetres at training size, 0 where unmeasured
+native/png              uint8 [bytes]        truth at native resolution: 16-bit PNGs [mm], one after another
+native/end              int64 [n]            where each of them ends
+records/<field>         [n]                  id, scene, frame, split, category of each pair
+======================  ===================  ==========================================================
+
+The attribute ``info`` is a JSON object with the source's name and fingerprint, encoding, depth range and skipped files.
+A file without it was never finished; since stores are renamed into place only when whole, none should be seen.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hudepth.data.sources.base import Record
+from hudepth.errors import DataError
+
+FORMAT = "hudepth-depth-store"
+VERSION = 1
+MM_PER_M = 1000.0
+MAX_STORED_M = np.iinfo(np.uint16).max / MM_PER_M
+"""65.535 m: what lies beyond is stored as this."""
+
+
+def to_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Round metres to the millimetres a store holds; 0 (unmeasured) stays 0.
+
+    A measured depth never becomes 0: below half a millimetre it is stored as one.
+
+    Args:
+        depth_m: [h, w], finite and not negative [m].
+    """
+    mm = np.rint(np.minimum(depth_m, MAX_STORED_M) * MM_PER_M)
+    return np.maximum(mm, depth_m > 0).astype(np.uint16)
+
+
+class StoreWriter:
+    """Writes a depth store pair by pair. Use it inside :func:`hudepth.files.written_whole`."""
+
+    def __init__(self, path: Path, *, size: tuple[int, int], native: bool) -> None:
+        self._file = h5py.File(path, "w", libver="latest")
+        height, width = size
+        self._image = self._file.create_dataset(
+            "image", (0, height, width, 3), "u1", maxshape=(None, height, width, 3), chunks=(1, height, width, 3)
+        )
+        self._depth = self._file.create_dataset(
+            "depth_mm", (0, height, width), "u2", maxshape=(None, height, width), chunks=(1, height, width)
+        )
+        self._native = native
+        if native:
+            self._png = self._file.create_dataset("native/png", (0,), "u1", maxshape=(None,), chunks=(1 << 20,))
+        self._ends: list[int] = []
+        self._records: list[Record] = []
+
+    def append(
+        self,
+        record: Record,
+        image: NDArray[np.uint8],
+        depth_mm: NDArray[np.uint16],
+        native_png: NDArray[np.uint8] | None,
+    ) -> None:
+        """Add one pair at training size, with its native truth as an encoded 16-bit PNG if the store has them."""
+        row = len(self._records)
+        if row == len(self._image):  # grow by doubling: a resize rewrites the index of chunks
+            for dataset in (self._image, self._depth):
+                dataset.resize(max(64, 2 * row), axis=0)
+        self._image[row] = image
+        self._depth[row] = depth_mm
+        if self._native and native_png is not None:
+            start = self._ends[-1] if self._ends else 0
+            self._png.resize(start + len(native_png), axis=0)
+            self._png[start:] = native_png
+            self._ends.append(start + len(native_png))
+        self._records.append(record)
+
+    def close(self, info: dict[str, Any]) -> None:
+        """Write the records and ``info``, and close the file."""
+        n = len(self._records)
+        for dataset in (self._image, self._depth):
+            dataset.resize(n, axis=0)
+        if self._native:
+            self._file["native/end"] = np.array(self._ends, dtype=np.int64)
+        for field in ("id", "scene", "split", "category"):
+            values = [getattr(record, field).encode() for record in self._records]
+            self._file[f"records/{field}"] = np.array(values, dtype=h5py.string_dtype())
+        self._file["records/frame"] = np.array([record.frame for record in self._records], dtype=np.int64)
+        self._file.attrs["format"] = FORMAT
+        self._file.attrs["version"] = VERSION
+        self._file.attrs["info"] = json.dumps(info)
+        self._file.close()
+
+    def abort(self) -> None:
+        """Close the file as it is; without its ``info`` nothing will take it for a store."""
+        self._file.close()
+
+
+class DepthStore:
+    """A depth store, opened for reading.
+
+    It can be handed to worker processes: the HDF5 handle is opened on first use in each and never pickled.
+
+    Args:
+        path: the file.
+
+    Raises:
+        DataError: if it is missing, unfinished or of another version.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._file: h5py.File | None = None
+        try:
+            with h5py.File(self.path, "r") as file:
+                if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
+                    raise DataError(f"'{self.path}' is no depth store of version {VERSION}. Delete it and prepare again.")
+                self.info: dict[str, Any] = json.loads(file.attrs["info"])
+                self.size: tuple[int, int] = tuple(file["image"].shape[1:3])
+                columns = {field: file[f"records/{field}"].asstr()[:] for field in ("id", "scene", "split", "category")}
+                frames = file["records/frame"][:]
+                self.has_native = "native" in file
+        except (OSError, KeyError, json.JSONDecodeError) as error:
+            raise DataError(f"'{self.path}' cannot be read as a depth store ({error}). Delete it and prepare again.") from error
+        self.records = [
+            Record(id=i, scene=s, frame=int(f), split=p, category=c)
+            for i, s, f, p, c in zip(
+                columns["id"], columns["scene"], frames, columns["split"], columns["category"], strict=True
+            )
+        ]
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None}
+
+    @property
+    def _open(self) -> h5py.File:
+        if self._file is None:
+            self._file = h5py.File(self.path, "r")
+        return self._file
+
+    def read(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """Read pairs at training size.
+
+        Args:
+            indices: positions in the store, in any order, possibly repeated.
+
+        Returns:
+            image [n, h, w, 3] RGB, and depth [n, h, w] in millimetres, 0 where unmeasured.
+        """
+        images = np.empty((len(indices), *self.size, 3), np.uint8)
+        depths = np.empty((len(indices), *self.size), np.uint16)
+        source_image, source_depth = self._open["image"], self._open["depth_mm"]
+        for row, index in enumerate(indices):
+            source_image.read_direct(images, np.s_[index], np.s_[row])
+            source_depth.read_direct(depths, np.s_[index], np.s_[row])
+        return images, depths
+
+    def read_native(self, index: int) -> NDArray[np.float32]:
+        """Read one truth at its native resolution: [H, W] metres, 0 where unmeasured.
+
+        Raises:
+            DataError: if the store was prepared without native truth.
+        """
+        if not self.has_native:
+            raise DataError(
+                f"'{self.path}' holds no native-resolution truth, which this protocol scores against. "
+                "Pass data.native=true, or protocol=paper."
+            )
+        ends = self._open["native/end"]
+        start = int(ends[index - 1]) if index else 0
+        mm = cv2.imdecode(self._open["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
+        return (mm / np.float32(MM_PER_M)).astype(np.float32)

@@ -1,0 +1,104 @@
+"""One pass over a test subset: any number of predictors, scored under any number of protocols."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+
+from hudepth.data.store import DepthStore
+from hudepth.metrics.protocol import Protocol
+from hudepth.types import Batch
+
+
+class ConstantDepth(nn.Module):
+    """A trivial baseline: answers every image with the same unit depth map.
+
+    Args:
+        unit_depth: [1, 1, h, w].
+    """
+
+    unit_depth: Tensor
+
+    def __init__(self, unit_depth: Float[Tensor, "1 1 h w"]) -> None:
+        super().__init__()
+        self.register_buffer("unit_depth", unit_depth)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Return the map, once for each image."""
+        return self.unit_depth.expand(len(image), -1, -1, -1)
+
+
+def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: float) -> dict[str, nn.Module]:
+    """Make the baselines any model must beat, from the training subset alone.
+
+    Args:
+        store: holds the truth.
+        train: positions of the training pairs.
+        max_depth_m: depth is clipped to it and divided by it.
+
+    Returns:
+        ``mean_depth_map``: each pixel's mean over the training set; ``mean_depth``: one mean for all pixels.
+    """
+    total = torch.zeros(store.size, dtype=torch.float64)
+    count = torch.zeros(store.size, dtype=torch.float64)
+    for start in range(0, len(train), 64):
+        _, depth_mm = store.read(train[start : start + 64])
+        unit = (torch.from_numpy(depth_mm).double() / (1000 * max_depth_m)).clamp_(max=1)
+        total += unit.sum(dim=0)
+        count += (unit > 0).sum(dim=0)
+    mean = total.sum() / count.sum()
+    mean_map = torch.where(count > 0, total / count.clamp(min=1), mean)
+    return {
+        "mean_depth_map": ConstantDepth(mean_map.float()[None, None]),
+        "mean_depth": ConstantDepth(torch.full_like(mean_map, mean).float()[None, None]),
+    }
+
+
+class Evaluation(LightningModule):
+    """Collects, for each predictor and protocol, one row of sums an image. Run it with ``Trainer.test``.
+
+    Args:
+        predictors: by name; normalised image to unit depth.
+        protocols: how to score.
+        max_depth_m: what unit depth 1 stands for.
+    """
+
+    def __init__(
+        self, predictors: Mapping[str, nn.Module], protocols: Sequence[Protocol], *, max_depth_m: float
+    ) -> None:
+        super().__init__()
+        self.predictors = nn.ModuleDict(dict(predictors))
+        self.protocols = list(protocols)
+        self.max_depth_m = max_depth_m
+        self._rows: dict[tuple[str, str], list[Tensor]] = {}
+        self._indices: list[Tensor] = []
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        """Score a batch."""
+        self._indices.append(batch["index"].cpu())
+        for name, predictor in self.predictors.items():
+            pred_m = predictor(batch["image"]).float() * self.max_depth_m
+            for protocol in self.protocols:
+                sums = protocol.score(pred_m, batch, max_depth_m=self.max_depth_m)
+                self._rows.setdefault((name, protocol.name), []).append(sums.cpu())
+
+    def indices(self) -> list[int]:
+        """Return the store positions of the scored images, in the order of the rows."""
+        return torch.cat(_gather(torch.cat(self._indices))).tolist()
+
+    def sums(self, predictor: str, protocol: str) -> Float[Tensor, "n k"]:
+        """Return the rows of one predictor under one protocol, over all processes."""
+        return torch.cat(_gather(torch.cat(self._rows[predictor, protocol])))
+
+
+def _gather(own: Tensor) -> list[Tensor]:
+    """Collect a tensor from every process; they may differ in length."""
+    if not torch.distributed.is_initialized():
+        return [own]
+    everyone: list[Tensor] = [own] * torch.distributed.get_world_size()
+    torch.distributed.all_gather_object(everyone, own)
+    return everyone

@@ -1,0 +1,69 @@
+"""The --help of the console scripts: what each does, the groups it is configured by, examples."""
+
+from __future__ import annotations
+
+from hudepth.cli import conf_folder, options_of
+
+ABOUT = {
+    "train": "Train a monocular depth model, then test its best checkpoint. Everything goes to runs/<name>/<date_time>/.",
+    "test": "Score a checkpoint. It needs nothing but the checkpoint: model, data and split are recorded in it.",
+    "data": "Prepare a data set once as a depth store, or show what is known of it.",
+}
+
+USAGE = {
+    "train": "hudepth-train [+experiment=NAME] [group=NAME ...] [key=value ...]",
+    "test": "hudepth-test checkpoint=<file | run directory | last> [data=NAME] [protocol=NAME] [key=value ...]",
+    "data": "hudepth-data prepare|info data=NAME [data.root=PATH] [key=value ...]",
+}
+
+EXAMPLES = {
+    "train": (
+        ("hudepth-train +experiment=demo", "a first model, in minutes, on built-in rooms"),
+        ("hudepth-train +experiment=badcl data=nyu_labeled data.root=nyu", "the paper's recipe on real NYU depth"),
+        ("hudepth-train loss=silog optim.lr=3e-4 trainer.max_epochs=10", "other parts, other values"),
+        ("hudepth-train -m loss=badcl,l1,silog seed=1,2,3", "every combination, one run each"),
+        ("hudepth-train resume=runs/badcl/2025-08-11_12-00-00", "go on after an interruption"),
+    ),
+    "test": (
+        ("hudepth-test checkpoint=last", "the newest run, under the paper's and the eigen protocol"),
+        ("hudepth-test checkpoint=runs/badcl/2025-08-11_12-00-00", "the best checkpoint of a run"),
+        ("hudepth-test checkpoint=best.ckpt protocol=eigen", "a file, one protocol"),
+        ("hudepth-test checkpoint=best.ckpt data.root=/data/nyu", "the same data, in another place"),
+        ("hudepth-test checkpoint=best.ckpt data=rooms", "other data than it was trained on"),
+    ),
+    "data": (
+        ("hudepth-data info data=nyu_labeled data.root=nyu", "pairs, scenes, splits"),
+        ("hudepth-data prepare data=nyu_labeled data.root=nyu", "decode, check and resize everything once"),
+        ("hudepth-data prepare data=densedepth data.root=nyu_data.zip", "straight from the zip"),
+        ("hudepth-data prepare data=folder data.root=mine data.encoding=uint16_mm", "your own images and depths"),
+        ("hudepth-data prepare data=manifest data.root=mine data.on_error=skip", "leave out, and list, bad files"),
+    ),
+}
+
+SHARED_OPTIONS = (
+    ("--cfg job", "print the configuration and stop"),
+    ("-m", "multirun: comma-separated values become one run each"),
+    ("debug=true", "show the traceback of an error"),
+    ("-sc install=bash", 'tab completion: eval "$(hudepth-train -sc install=bash)"; also zsh, fish'),
+)
+
+
+def help_text(task: str) -> str:
+    """Return the help of ``hudepth-<task>``."""
+    lines = [ABOUT[task], "", f"  {USAGE[task]}", "", "Examples"]
+    width = max(len(command) for command, _ in EXAMPLES[task])
+    lines += [f"  {command:<{width}}  {meaning}" for command, meaning in EXAMPLES[task]]
+    lines += ["", "Groups (choose with group=NAME)"]
+    groups = _groups(task)
+    lines += [f"  {group:<12}{', '.join(options_of(group))}" for group in groups]
+    lines += ["", "Options"]
+    lines += [f"  {option:<18}{meaning}" for option, meaning in SHARED_OPTIONS]
+    return "\n".join(lines)
+
+
+def _groups(task: str) -> list[str]:
+    """Return the groups a task's configuration is made of, plus those that can be added."""
+    text = (conf_folder() / f"{task}.yaml").read_text(encoding="utf-8")
+    named = [line.split("-", 1)[1].split(":")[0].strip() for line in text.splitlines() if line.startswith("  - ")]
+    groups = [name for name in named if name not in ("_self_", "hydra", "paths")]
+    return [*groups, "experiment", "sweep"] if task == "train" else groups

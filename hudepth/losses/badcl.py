@@ -1,0 +1,265 @@
+"""Boundary-Aware Depth Consistency Loss (Turkmen and Akgun 2025, sections 3.2 to 3.4).
+
+    L_boundary   = 1/N sum_i B(i) |D^(i) - D(i)|        B(i) = exp(sqrt(Ix^2 + Iy^2))
+    L_smoothness = 1/N sum_i |D^_x(i)| exp(-|Ix(i)|) + |D^_y(i)| exp(-|Iy(i)|)
+    L_scaling    = 1/N sum_i s |D^(i) - D(i)|           s = sum_i D(i) / (sum_i D^(i) + eps)
+    L_BADCL      = 3.0 L_boundary + 1.2 L_smoothness + 1.0 L_scaling
+
+D is the truth, D^ the prediction, I the image. N counts the valid pixels of the batch where the truth is
+compared, and all pixels in L_smoothness, which concerns the prediction only. What the paper leaves open is an
+option of :class:`BADCL`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hudepth.errors import ConfigError, did_you_mean
+from hudepth.masked import full_precision, masked_mean, masked_sum
+from hudepth.normalise import denormalise_image
+from hudepth.types import LossTerms
+
+CHOICES = {
+    "boundary_sign": ("plus", "minus"),
+    "image_space": ("unit", "normalised"),
+    "image_channels": ("grey", "colour"),
+    "scale_per": ("image", "batch"),
+    "scale_mode": ("weight", "align"),
+    "scale_gradient": ("flow", "stop"),
+}
+"""The named options of :class:`BADCL` and their values, the default first."""
+
+BT601_LUMA = (0.299, 0.587, 0.114)
+"""Weights of R, G and B in luma (ITU-R BT.601)."""
+
+
+def check_choices(**options: str) -> None:
+    """Raise :class:`ConfigError` if an option's value is not among its :data:`CHOICES`."""
+    for option, value in options.items():
+        if value not in CHOICES[option]:
+            known = " or ".join(f"'{choice}'" for choice in CHOICES[option])
+            hint = did_you_mean(str(value), CHOICES[option])
+            raise ConfigError(f"loss.{option}: no choice '{value}'. Use {known}.{hint}")
+
+
+def forward_difference(x: Float[Tensor, "b c h w"], *, dim: int) -> Float[Tensor, "b c h w"]:
+    """Next pixel minus this one along ``dim`` (-1: horizontal, -2: vertical); 0 in the last column or row."""
+    return torch.diff(x, dim=dim, append=x.narrow(dim, -1, 1))
+
+
+def luma(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+    """BT.601 luma of an RGB image, in the image's units."""
+    red, green, blue = image.unbind(dim=1)
+    return (BT601_LUMA[0] * red + BT601_LUMA[1] * green + BT601_LUMA[2] * blue).unsqueeze(1)
+
+
+def boundary_weight(
+    image_dx: Float[Tensor, "b c h w"], image_dy: Float[Tensor, "b c h w"], *, sign: str = "plus"
+) -> Float[Tensor, "b 1 h w"]:
+    """B = exp(+-|grad I|), the gradient's magnitude averaged over channels (equation 2).
+
+    Args:
+        image_dx: horizontal differences of the image. Expected without gradient: the root has none at 0.
+        image_dy: vertical differences.
+        sign: "plus" stresses edges, as the paper says of B; "minus" spares them.
+
+    Raises:
+        ConfigError: if ``sign`` is unknown.
+    """
+    check_choices(boundary_sign=sign)
+    magnitude = torch.hypot(image_dx, image_dy).mean(dim=1, keepdim=True)
+    return torch.exp(magnitude if sign == "plus" else -magnitude)
+
+
+def boundary_loss(
+    pred: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    weight: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+) -> Float[Tensor, ""]:
+    """Mean over valid pixels of the absolute error times its :func:`boundary_weight` (equation 1)."""
+    return masked_mean(weight * _difference(pred, target, valid).abs(), valid)
+
+
+def smoothness_loss(
+    pred: Float[Tensor, "b 1 h w"], image_dx: Float[Tensor, "b c h w"], image_dy: Float[Tensor, "b c h w"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of neighbouring predictions, damped where the image has edges (equation 3).
+
+    It concerns the prediction only and is averaged over all pixels, so it acts also where the truth is
+    unmeasured. Over several channels the magnitudes of the image's differences are averaged.
+    """
+    weight_x = torch.exp(-image_dx.abs().mean(dim=1, keepdim=True))
+    weight_y = torch.exp(-image_dy.abs().mean(dim=1, keepdim=True))
+    horizontal = forward_difference(pred, dim=-1).abs() * weight_x
+    vertical = forward_difference(pred, dim=-2).abs() * weight_y
+    return (horizontal + vertical).mean()
+
+
+def scaling_factor(
+    pred: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    per: str = "image",
+    eps: float = 1e-8,
+) -> Float[Tensor, "n 1 1 1"]:
+    """The factor s = sum D / (sum D^ + eps) of equation 5, over valid pixels.
+
+    A negative sum of predictions, which unit depth cannot have, counts as 0: s stays finite and not negative.
+
+    Args:
+        pred: unit depth.
+        target: unit depth; ignored where not valid.
+        valid: True where the truth is measured.
+        per: s for each "image" (n = b), or one for the "batch" (n = 1).
+        eps: added to the sum of predictions.
+
+    Raises:
+        ConfigError: if ``per`` is neither "image" nor "batch".
+    """
+    check_choices(scale_per=per)
+    dim = (1, 2, 3) if per == "image" else (0, 1, 2, 3)
+    return masked_sum(target, valid, dim=dim) / (masked_sum(pred, valid, dim=dim).clamp_min(0) + eps)
+
+
+def scaling_loss(
+    pred: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    per: str = "image",
+    mode: str = "weight",
+    gradient: str = "flow",
+    eps: float = 1e-8,
+) -> Float[Tensor, ""]:
+    """Mean over valid pixels of an error that is scaled by s (equation 4; see :func:`scaling_factor`).
+
+    Args:
+        pred: unit depth.
+        target: unit depth; ignored where not valid.
+        valid: True where the truth is measured.
+        per: s for each "image", or one for the "batch".
+        mode: "weight": s |D^ - D|, as printed; "align": |s D^ - D|, the usual alignment of scale.
+        gradient: "flow" through s, or "stop" there.
+        eps: added to the sum of predictions.
+
+    Raises:
+        ConfigError: if an option is unknown.
+    """
+    check_choices(scale_mode=mode, scale_gradient=gradient)
+    factor = scaling_factor(pred, target, valid, per=per, eps=eps)
+    if gradient == "stop":
+        factor = factor.detach()
+    if mode == "weight":
+        return masked_mean(factor * _difference(pred, target, valid).abs(), valid)
+    return masked_mean(_difference(factor * pred, target, valid).abs(), valid)
+
+
+class BADCL(nn.Module):
+    """The paper's loss: boundary, smoothness and scaling terms, weighted and summed (section 3.3).
+
+    Args:
+        boundary: weight of the boundary term, at least 0. A term of weight 0 is not computed.
+        smoothness: weight of the smoothness term.
+        scaling: weight of the scaling term.
+        eps: added to the sum of predictions in the scaling factor, at least 1e-12.
+        boundary_sign: "plus" or "minus" in the exponent of the boundary weight.
+        image_space: "unit": the image in [0, 1] guides both weights; "normalised": as the network sees it.
+        image_channels: "grey": gradients of the luma; "colour": their magnitudes averaged over channels.
+        scale_per: one scaling factor per "image" or per "batch".
+        scale_mode: "weight": s |D^ - D|, as printed; "align": |s D^ - D|.
+        scale_gradient: "flow" or "stop": whether gradients pass through s.
+
+    Raises:
+        ConfigError: if an option is unknown, a weight negative or not finite, all are 0, or eps is too small.
+    """
+
+    def __init__(
+        self,
+        *,
+        boundary: float = 3.0,
+        smoothness: float = 1.2,
+        scaling: float = 1.0,
+        eps: float = 1e-8,
+        boundary_sign: str = "plus",
+        image_space: str = "unit",
+        image_channels: str = "grey",
+        scale_per: str = "image",
+        scale_mode: str = "weight",
+        scale_gradient: str = "flow",
+    ) -> None:
+        super().__init__()
+        self.weights = {"boundary": boundary, "smoothness": smoothness, "scaling": scaling}
+        _check_weights(self.weights)
+        if not eps >= 1e-12:
+            raise ConfigError(f"loss.eps: {eps} is too small for float32. Use at least 1e-12.")
+        check_choices(boundary_sign=boundary_sign, image_space=image_space, image_channels=image_channels)
+        check_choices(scale_per=scale_per, scale_mode=scale_mode, scale_gradient=scale_gradient)
+        self.boundary_sign = boundary_sign
+        self.image_space = image_space
+        self.image_channels = image_channels
+        self.scaling_loss = partial(
+            scaling_loss, per=scale_per, mode=scale_mode, gradient=scale_gradient, eps=eps
+        )
+
+    def forward(
+        self,
+        pred: Float[Tensor, "b 1 h w"],
+        target: Float[Tensor, "b 1 h w"],
+        image: Float[Tensor, "b 3 h w"],
+        valid: Bool[Tensor, "b 1 h w"],
+    ) -> LossTerms:
+        """Return the weighted sum and each raw term, in float32 (float64 for float64) whatever autocast says.
+
+        Value and gradient are finite for any prediction and truth in [0, 1], also where nothing is valid.
+
+        Args:
+            pred: unit depth in [0, 1].
+            target: unit depth in [0, 1]; ignored where not valid.
+            image: RGB, ImageNet-normalised. It only weights; no gradient reaches it.
+            valid: True where the truth is measured.
+        """
+        with torch.autocast(pred.device.type, enabled=False):
+            terms = self._terms(
+                full_precision(pred), full_precision(target), full_precision(image.detach()), valid
+            )
+            total = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
+        return LossTerms(total, terms)
+
+    def _terms(self, pred: Tensor, target: Tensor, image: Tensor, valid: Tensor) -> dict[str, Tensor]:
+        terms = {}
+        if self.weights["boundary"] or self.weights["smoothness"]:
+            guide = denormalise_image(image) if self.image_space == "unit" else image
+            guide = luma(guide) if self.image_channels == "grey" else guide
+            dx, dy = forward_difference(guide, dim=-1), forward_difference(guide, dim=-2)
+        if self.weights["boundary"]:
+            weight = boundary_weight(dx, dy, sign=self.boundary_sign)
+            terms["boundary"] = boundary_loss(pred, target, weight, valid)
+        if self.weights["smoothness"]:
+            terms["smoothness"] = smoothness_loss(pred, dx, dy)
+        if self.weights["scaling"]:
+            terms["scaling"] = self.scaling_loss(pred, target, valid)
+        return terms
+
+
+def _difference(pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    # masked before any other arithmetic, which an invalid NaN must not enter
+    return torch.where(valid, pred - target, 0.0)
+
+
+def _check_weights(weights: dict[str, float]) -> None:
+    for name, weight in weights.items():
+        if not (math.isfinite(weight) and weight >= 0):
+            raise ConfigError(
+                f"loss.{name}: weight {weight}. Use a finite number of at least 0 (0 leaves the term out)."
+            )
+    if not any(weights.values()):
+        raise ConfigError(
+            f"loss: {', '.join(weights)} all have weight 0. Give at least one a positive weight."
+        )

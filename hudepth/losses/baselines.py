@@ -1,0 +1,179 @@
+"""Losses of the field to compare BADCL with: L1, L2, BerHu (Laina et al. 2016), SILog (Eigen et al. 2014).
+
+All are means over the valid pixels of the batch, and 0 where nothing is valid.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hudepth.errors import ConfigError
+from hudepth.masked import full_precision, masked_mean
+from hudepth.types import LossTerms
+
+MIN_UNIT_DEPTH = 1e-3
+"""Depths below this count as this under a logarithm: 1 cm where the unit is 10 m."""
+
+
+def l1_loss(
+    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Mean absolute error."""
+    return masked_mean(torch.where(valid, pred - target, 0.0).abs(), valid)
+
+
+def l2_loss(
+    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Mean squared error."""
+    return masked_mean(torch.where(valid, pred - target, 0.0).square(), valid)
+
+
+def berhu_loss(
+    pred: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    threshold: float = 0.2,
+) -> Float[Tensor, ""]:
+    """Reverse Huber: |e| up to c, (e^2 + c^2) / (2 c) above (Laina et al. 2016).
+
+    c = ``threshold`` * the largest |e| among the valid pixels of the batch; no gradient flows through it.
+    """
+    error = torch.where(valid, pred - target, 0.0).abs()
+    # tiny: without any error c is 0, and the branch not taken must not divide by it
+    c = (threshold * error.detach().amax()).clamp_min(torch.finfo(error.dtype).tiny)
+    return masked_mean(torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)), valid)
+
+
+def silog_loss(
+    pred: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    variance_focus: float = 0.85,
+    factor: float = 10.0,
+) -> Float[Tensor, ""]:
+    """Scale-invariant error: factor * sqrt(mean(g^2) - variance_focus * mean(g)^2), g = ln pred - ln target.
+
+    The loss of Eigen et al. 2014 under a root and with the constants of BTS and AdaBins. Depths below
+    :data:`MIN_UNIT_DEPTH` count as that. ``variance_focus`` is in [0, 1]: 0 leaves the RMSE of logs, 1
+    forgives any common scale.
+    """
+    pred = torch.where(valid, pred, 1.0).clamp_min(MIN_UNIT_DEPTH)
+    target = torch.where(valid, target, 1.0).clamp_min(MIN_UNIT_DEPTH)
+    g = pred.log() - target.log()
+    mean = masked_mean(g, valid)
+    # the same as mean(g^2) - variance_focus * mean^2, but a sum of squares: rounding cannot make it negative
+    radicand = masked_mean((g - mean).square(), valid) + (1 - variance_focus) * mean.square()
+    # the root has no gradient at 0, so it never sees one
+    positive = radicand > 0
+    return factor * torch.where(positive, torch.where(positive, radicand, 1.0).sqrt(), 0.0)
+
+
+class SingleTermLoss(nn.Module, ABC):
+    """A loss of one term, called like :class:`hudepth.losses.BADCL`."""
+
+    name: ClassVar[str]
+    """What its term is called."""
+
+    def forward(
+        self,
+        pred: Float[Tensor, "b 1 h w"],
+        target: Float[Tensor, "b 1 h w"],
+        image: Float[Tensor, "b 3 h w"],
+        valid: Bool[Tensor, "b 1 h w"],
+    ) -> LossTerms:
+        """Return the loss, in float32 (float64 for float64) whatever autocast says.
+
+        Args:
+            pred: unit depth in [0, 1].
+            target: unit depth in [0, 1]; ignored where not valid.
+            image: not used.
+            valid: True where the truth is measured.
+        """
+        with torch.autocast(pred.device.type, enabled=False):
+            value = self.value(full_precision(pred), full_precision(target), valid)
+        return LossTerms(value, {self.name: value})
+
+    @abstractmethod
+    def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+        """Return the loss of full-precision inputs."""
+
+
+class L1(SingleTermLoss):
+    """:func:`l1_loss` as a module."""
+
+    name = "l1"
+
+    def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+        """Return :func:`l1_loss`."""
+        return l1_loss(pred, target, valid)
+
+
+class L2(SingleTermLoss):
+    """:func:`l2_loss` as a module."""
+
+    name = "l2"
+
+    def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+        """Return :func:`l2_loss`."""
+        return l2_loss(pred, target, valid)
+
+
+class BerHu(SingleTermLoss):
+    """:func:`berhu_loss` as a module.
+
+    Args:
+        threshold: c as a fraction of the largest error, in (0, 1].
+
+    Raises:
+        ConfigError: if ``threshold`` is out of range.
+    """
+
+    name = "berhu"
+
+    def __init__(self, *, threshold: float = 0.2) -> None:
+        super().__init__()
+        if not 0 < threshold <= 1:
+            raise ConfigError(f"loss.threshold: {threshold} is not in (0, 1]. The usual value is 0.2.")
+        self.threshold = threshold
+
+    def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+        """Return :func:`berhu_loss`."""
+        return berhu_loss(pred, target, valid, threshold=self.threshold)
+
+
+class SILog(SingleTermLoss):
+    """:func:`silog_loss` as a module.
+
+    Args:
+        variance_focus: share of the squared mean that is forgiven, in [0, 1].
+        factor: scale of the loss, positive.
+
+    Raises:
+        ConfigError: if an option is out of range.
+    """
+
+    name = "silog"
+
+    def __init__(self, *, variance_focus: float = 0.85, factor: float = 10.0) -> None:
+        super().__init__()
+        if not 0 <= variance_focus <= 1:
+            raise ConfigError(
+                f"loss.variance_focus: {variance_focus} is not in [0, 1]. The usual value is 0.85."
+            )
+        if not (math.isfinite(factor) and factor > 0):
+            raise ConfigError(f"loss.factor: {factor} is not positive. The usual value is 10.")
+        self.variance_focus = variance_focus
+        self.factor = factor
+
+    def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+        """Return :func:`silog_loss`."""
+        return silog_loss(pred, target, valid, variance_focus=self.variance_focus, factor=self.factor)

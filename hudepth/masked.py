@@ -1,0 +1,28 @@
+"""Sums and means over valid pixels, in full precision: what every loss and metric reduces with."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def full_precision(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Return ``x`` as float32, or as it is if float64: half precision cannot hold a sum over an image."""
+    return x if x.dtype == torch.float64 else x.float()
+
+
+def masked_sum(
+    x: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"], *, dim: tuple[int, ...] | None = None
+) -> Float[Tensor, "*reduced"]:
+    """Sum ``x`` where ``valid``: over all dimensions, or over ``dim``, which then stay with size 1.
+
+    Invalid values may be NaN or infinite: they reach neither the sum nor the gradient of ``x``. But 0 times
+    NaN is NaN in the gradient of what computed ``x``: mask its inputs where they enter the arithmetic.
+    """
+    return torch.where(valid, x, 0.0).sum(dim=dim, keepdim=dim is not None)
+
+
+def masked_mean(x: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Mean of ``x`` where ``valid``, over all dimensions; 0 with zero gradient where nothing is valid."""
+    return masked_sum(x, valid) / valid.sum().clamp_min(1)

@@ -1,0 +1,100 @@
+"""The hybrid UNet of Turkmen & Akgun (2025), table A1: ResNet-18 trunk, two transformer blocks, three up blocks."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hudepth.errors import ConfigError
+from hudepth.models.attention import TransformerBlock
+from hudepth.models.decoder import UpBlock, UpsampleMode
+from hudepth.models.options import OUTPUTS, choose
+from hudepth.models.resnet import ResNet18Trunk
+
+STRIDE = 16
+"""The trunk's deepest map is 1/16 of the input, so both sides of an image must be multiples of it."""
+
+ATTENTION = {"none": (False, False), "skip": (True, False), "deepest": (False, True), "both": (True, True)}
+"""Where transformer blocks stand: (on layer2's output, which is skip 2; on layer3's output)."""
+
+
+class HybridUNet(nn.Module):
+    """One normalised RGB image in, one unit depth map of the same size out; 4,653,313 parameters by default.
+
+    Table A1 is the authority where it differs from the paper's text. What neither states is an option.
+
+    Args:
+        weights: the trunk's start: ``imagenet``, a path, or ``none`` (see :class:`ResNet18Trunk`).
+        attention: transformer blocks on ``none``, ``skip``, ``deepest`` or ``both`` (table A1).
+        attention_heads: heads of each block (not stated in the paper).
+        attention_activation: relu, gelu or silu inside each block (not stated).
+        upsample: ``nearest`` (figure 4 says UpSampling2D, whose default it is) or ``bilinear``.
+        output: ``sigmoid``, ``relu``, ``softplus`` or ``identity`` after the last convolution (not stated).
+
+    Raises:
+        ConfigError: for an unknown option.
+        CheckpointError: if the weights cannot be had or do not fit.
+    """
+
+    def __init__(
+        self,
+        *,
+        weights: str | None = None,
+        attention: str = "both",
+        attention_heads: int = 8,
+        attention_activation: str = "relu",
+        upsample: UpsampleMode = "nearest",
+        output: str = "sigmoid",
+    ) -> None:
+        super().__init__()
+        on_skip, on_deepest = choose("model.attention", attention, ATTENTION)
+        choose("model.upsample", upsample, {"nearest": 0, "bilinear": 0})
+
+        def block(channels: int) -> nn.Module:
+            return TransformerBlock(channels, heads=attention_heads, activation=attention_activation)
+
+        self.trunk = ResNet18Trunk(weights=weights)
+        self.attention_skip = block(128) if on_skip else nn.Identity()
+        self.attention_deepest = block(256) if on_deepest else nn.Identity()
+        self.up1 = UpBlock(256, 128, 128, upsample=upsample)
+        self.up2 = UpBlock(128, 64, 64, upsample=upsample)
+        self.up3 = UpBlock(64, 64, 64, upsample=upsample)
+        self.head_up = nn.ConvTranspose2d(64, 32, 4, stride=2, padding=1)
+        self.head = nn.Conv2d(32, 1, 3, padding=1)
+        self.output = choose("model.output", output, OUTPUTS)()
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Predict unit depth.
+
+        Args:
+            image: RGB, normalised with ImageNet's statistics; both sides multiples of 16.
+
+        Returns:
+            Depth / max_depth_m, in [0, 1] with the sigmoid output.
+
+        Raises:
+            ConfigError: if a side is not a multiple of 16; the message gives the nearest sizes that are.
+        """
+        check_size(*image.shape[-2:])
+        features = self.trunk(image)
+        x = self.attention_deepest(features.layer3)
+        x = self.up1(x, self.attention_skip(features.layer2))
+        x = self.up2(x, features.layer1)
+        x = self.up3(x, features.stem)
+        return self.output(self.head(self.head_up(x)))
+
+
+def check_size(height: int, width: int) -> None:
+    """Check that the network can take images of this size.
+
+    Raises:
+        ConfigError: if a side is not a positive multiple of 16; the message computes the nearest sizes.
+    """
+    if height < STRIDE or width < STRIDE or height % STRIDE or width % STRIDE:
+        below = [max(STRIDE, side // STRIDE * STRIDE) for side in (height, width)]
+        above = [max(STRIDE, -(-side // STRIDE) * STRIDE) for side in (height, width)]
+        nearest = " or ".join(dict.fromkeys(f"[{h},{w}]" for h, w in (below, above)))
+        raise ConfigError(
+            f"data.size: images of {height} x {width} (height x width), but both sides must be multiples of "
+            f"{STRIDE}. Pass data.size={nearest}."
+        )

@@ -1,0 +1,151 @@
+"""ResNet-18 up to and including layer3: the encoder of table A1 (He et al., CVPR 2016).
+
+Parameter names are torchvision's, so that its ImageNet file loads as it is.
+"""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import NamedTuple
+from urllib.error import URLError
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hudepth.errors import CheckpointError, did_you_mean
+
+IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
+"""torchvision's ResNet18_Weights.IMAGENET1K_V1; the name carries the first digits of the file's sha256."""
+
+IGNORED_PREFIXES = ("layer4.", "fc.")
+"""Parts of a full ResNet-18 file that the trunk does not have."""
+
+
+class Features(NamedTuple):
+    """What the trunk hands to attention and decoder, finest first."""
+
+    stem: Float[Tensor, "b 64 h/2 w/2"]
+    layer1: Float[Tensor, "b 64 h/4 w/4"]
+    layer2: Float[Tensor, "b 128 h/8 w/8"]
+    layer3: Float[Tensor, "b 256 h/16 w/16"]
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions and a shortcut, which is a 1x1 convolution where the shape changes."""
+
+    def __init__(self, channels_in: int, channels_out: int, *, stride: int = 1) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, channels_out, 3, stride=stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels_out)
+        self.relu = nn.ReLU(inplace=True)
+        self.conv2 = nn.Conv2d(channels_out, channels_out, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels_out)
+        self.downsample: nn.Sequential | None = None
+        if stride != 1 or channels_in != channels_out:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(channels_in, channels_out, 1, stride=stride, bias=False), nn.BatchNorm2d(channels_out)
+            )
+
+    def forward(self, x: Float[Tensor, "b c_in h w"]) -> Float[Tensor, "b c_out h2 w2"]:
+        """Return the block's output, of half the size where the stride is 2."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        x = self.relu(self.bn1(self.conv1(x)))
+        return self.relu(self.bn2(self.conv2(x)) + shortcut)
+
+
+class ResNet18Trunk(nn.Module):
+    """ResNet-18 without layer4 and fc.
+
+    Args:
+        weights: ``imagenet`` (torchvision's file, downloaded once and checked by its hash), the path of a file with
+            torchvision's parameter names, or ``none`` for random values.
+
+    Raises:
+        CheckpointError: if the weights cannot be had or do not fit.
+    """
+
+    def __init__(self, *, weights: str | None = None) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.relu = nn.ReLU(inplace=True)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        self.layer1 = nn.Sequential(BasicBlock(64, 64), BasicBlock(64, 64))
+        self.layer2 = nn.Sequential(BasicBlock(64, 128, stride=2), BasicBlock(128, 128))
+        self.layer3 = nn.Sequential(BasicBlock(128, 256, stride=2), BasicBlock(256, 256))
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        if weights not in (None, "none"):
+            load_trunk_weights(self, weights)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Features:
+        """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size."""
+        stem = self.relu(self.bn1(self.conv1(image)))
+        layer1 = self.layer1(self.maxpool(stem))
+        layer2 = self.layer2(layer1)
+        return Features(stem, layer1, layer2, self.layer3(layer2))
+
+
+def load_trunk_weights(trunk: ResNet18Trunk, weights: str) -> None:
+    """Load ImageNet weights into ``trunk``; layer4 and fc in the file are ignored, all else must fit.
+
+    Args:
+        trunk: the module to fill.
+        weights: ``imagenet`` or a path.
+
+    Raises:
+        CheckpointError: if the file cannot be downloaded or read, or a tensor is missing, unknown or misshapen.
+    """
+    state = _download_imagenet() if weights == "imagenet" else _read_weights(Path(weights).expanduser())
+    state = {name: value for name, value in state.items() if not name.startswith(IGNORED_PREFIXES)}
+    own = trunk.state_dict()
+    missing = sorted(own.keys() - state.keys())
+    unknown = sorted(state.keys() - own.keys())
+    misshapen = sorted(name for name in own.keys() & state.keys() if own[name].shape != state[name].shape)
+    for problem, names in (("lacks", missing), ("has unknown", unknown), ("has misshapen", misshapen)):
+        if names:
+            raise CheckpointError(
+                f"model.weights: '{weights}' {problem} {len(names)} tensors, the first is '{names[0]}'. "
+                "Pass a ResNet-18 file with torchvision's parameter names, or model.weights=none."
+            )
+    trunk.load_state_dict(state)
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        hint = did_you_mean(str(path), ["imagenet", "none"])
+        raise CheckpointError(
+            f"model.weights: no file '{path}'.{hint} Pass model.weights=imagenet, none, or the path of a ResNet-18 file."
+        )
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise CheckpointError(
+            f"model.weights: '{path}' is not a file of plain tensors ({type(error).__name__}). "
+            "Pass a ResNet-18 state_dict with torchvision's parameter names, or model.weights=none."
+        ) from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(
+            f"model.weights: '{path}' holds no state_dict. Pass a ResNet-18 file with torchvision's parameter names."
+        )
+    return state
+
+
+def _download_imagenet() -> dict[str, Tensor]:
+    timeout = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(20)  # seconds; urllib's own default is to wait forever
+    try:
+        state: dict[str, Tensor] = torch.hub.load_state_dict_from_url(
+            IMAGENET_URL, map_location="cpu", check_hash=True, weights_only=True
+        )
+    except (URLError, OSError, RuntimeError) as error:
+        raise CheckpointError(
+            f"model.weights=imagenet: could not download {IMAGENET_URL} ({error}). "
+            "Pass model.weights=<path to resnet18-f37072fd.pth>, or model.weights=none to train from scratch."
+        ) from error
+    finally:
+        socket.setdefaulttimeout(timeout)
+    return state

@@ -1,0 +1,33 @@
+"""A network small enough to train in milliseconds: for tests, debugging and smoke runs, not for depth."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hudepth.models.hybrid_unet import STRIDE, check_size
+
+
+class TinyUNet(nn.Module):
+    """A few thousand parameters with the hybrid UNet's interface: normalised RGB in, unit depth out.
+
+    Args:
+        channels: width of its only hidden layers.
+    """
+
+    def __init__(self, *, channels: int = 8) -> None:
+        super().__init__()
+        self.encode = nn.Conv2d(3, channels, STRIDE, stride=STRIDE)
+        self.norm = nn.BatchNorm2d(channels)
+        self.relu = nn.ReLU()
+        self.decode = nn.ConvTranspose2d(channels, 1, STRIDE, stride=STRIDE)
+        self.output = nn.Sigmoid()
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Predict unit depth in [0, 1].
+
+        Raises:
+            ConfigError: if a side of the image is not a multiple of 16.
+        """
+        check_size(*image.shape[-2:])
+        return self.output(self.decode(self.relu(self.norm(self.encode(image)))))

@@ -1,0 +1,122 @@
+"""The LightningModule: it joins network, loss and metrics, and holds no mathematics of its own."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+from torchmetrics import MetricCollection
+
+from hudepth import checkpoint as ckpt
+from hudepth.errors import TrainingError
+from hudepth.metrics.collection import DepthMetrics, DepthSSIM
+from hudepth.types import Batch
+
+
+class DepthModule(LightningModule):
+    """Trains a depth network.
+
+    Logged, for ``train`` and ``val``: ``total`` and every raw term of the loss, as means over the epoch. For ``val``
+    also the metrics of section 3.5 in metres, and SSIM on unit depth (data range 1).
+
+    Args:
+        net: normalised image to unit depth.
+        loss: called with prediction, unit depth, image and valid mask; returns :class:`hudepth.types.LossTerms`.
+        max_depth_m: what unit depth 1 stands for.
+        optimizer: makes an optimiser from parameters.
+        scheduler: makes a learning-rate schedule, stepped once an epoch, from an optimiser; None for a constant rate.
+        record: what each checkpoint carries beside the weights: ``config`` and ``split``, plain types only.
+    """
+
+    def __init__(
+        self,
+        net: nn.Module,
+        loss: nn.Module,
+        *,
+        max_depth_m: float,
+        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer],
+        scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        record: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.net = net
+        self.loss = loss
+        self.max_depth_m = max_depth_m
+        self.val_metrics = MetricCollection(
+            {"depth": DepthMetrics(), "ssim": DepthSSIM(data_range=max_depth_m)}, prefix="val/", compute_groups=False
+        )
+        self._make_optimizer, self._make_scheduler = optimizer, scheduler
+        self._record = record or {}
+        self._unchecked: deque[tuple[int, Tensor, Tensor]] = deque()
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Predict unit depth from normalised images."""
+        prediction: Tensor = self.net(image)
+        return prediction
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Return the loss of a batch."""
+        total = self._step(batch, "train")
+        self._check_finite(batch_idx, batch["index"], total.detach())
+        return total
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Log the loss of a batch and add it to the metrics."""
+        self._step(batch, "val")
+
+    def _step(self, batch: Batch, stage: str) -> Tensor:
+        pred = self(batch["image"])
+        loss = self.loss(pred, batch["unit_depth"], batch["image"], batch["valid"])
+        values = {f"{stage}/total": loss.total.detach(), **{f"{stage}/{k}": v.detach() for k, v in loss.terms.items()}}
+        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(pred))
+        if stage == "val":
+            depth_m = (x.float() * self.max_depth_m for x in (pred, batch["unit_depth"]))
+            self.val_metrics.update(*depth_m, batch["valid"])
+        total: Tensor = loss.total
+        return total
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics of the whole validation subset."""
+        self.log_dict({k: v.float() for k, v in self.val_metrics.compute().items()})
+        self.val_metrics.reset()
+
+    def on_train_epoch_end(self) -> None:
+        """Check the losses that were not looked at yet, before anything is saved."""
+        self._check_pending()
+
+    def _check_finite(self, batch_idx: int, index: Tensor, total: Tensor) -> None:
+        """Look at losses at once on a CPU; on a GPU in lots, since every look waits for the device."""
+        self._unchecked.append((batch_idx, index, total))
+        if len(self._unchecked) >= (1 if total.device.type == "cpu" else 50):
+            self._check_pending()
+
+    def _check_pending(self) -> None:
+        pending = list(self._unchecked)
+        self._unchecked.clear()
+        if not pending or bool(torch.stack([total for *_, total in pending]).isfinite().all()):
+            return
+        batch_idx, index, total = next(entry for entry in pending if not bool(entry[2].isfinite()))
+        store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
+        names = [store.records[i].id if store else str(i) for i in index.tolist()]
+        raise TrainingError(
+            f"the loss is {total.item()} in epoch {self.current_epoch}, batch {batch_idx}, of the pairs {', '.join(names)}. "
+            "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
+        )
+
+    def configure_optimizers(self) -> Any:
+        """Return the optimiser and, if there is one, the schedule."""
+        optimizer = self._make_optimizer(self.parameters())
+        if self._make_scheduler is None:
+            return optimizer
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._make_scheduler(optimizer), "interval": "epoch"}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the configuration and the split, so that a checkpoint needs nothing beside it."""
+        checkpoint[ckpt.KEY] = {"version": ckpt.VERSION, **self._record}

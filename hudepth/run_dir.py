@@ -1,0 +1,171 @@
+"""The run directory: everything a run leaves behind, and the one way to find and read it.
+
+::
+
+    runs/<name>/<date_time>/
+      config.yaml        resolved, plain YAML           overrides.txt   what was typed
+      environment.json   versions, git state, device    split.json      ids of each subset
+      status.json        running | finished | failed | interrupted
+      train.log          metrics.csv                    checkpoints/best.ckpt, last.ckpt
+      tensorboard/       images/                        test/<protocol>/metrics.json, per_image.csv, panels.png
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hudepth.console import log
+from hudepth.errors import CheckpointError, ConfigError
+from hudepth.files import write_json, write_text
+
+CHECKPOINTS = "checkpoints"
+BEST, LAST = "best.ckpt", "last.ckpt"
+PACKAGES = ("hudepth", "torch", "lightning", "torchmetrics", "hydra-core", "h5py", "numpy", "opencv-python-headless")
+
+
+def create(parent: str | Path, name: str) -> Path:
+    """Make ``<parent>/<name>/<date_time>``; a second run within the same second gets a number behind it.
+
+    Raises:
+        ConfigError: if the folder cannot be made.
+    """
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    base = Path(parent).expanduser() / name
+    for attempt in range(1, 1000):
+        path = base / (stamp if attempt == 1 else f"{stamp}_{attempt}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ConfigError(
+                f"paths.runs: cannot make '{path}' ({error.strerror}). Pass paths.runs=<a folder you can write to>."
+            ) from error
+        return path.resolve()
+    raise ConfigError(f"paths.runs: '{base}' holds too many runs of this second.")
+
+
+def write_start(path: Path, *, config: Mapping[str, Any], overrides: Sequence[str], environment: Mapping[str, Any]) -> None:
+    """Write what is known before a run begins: config.yaml, overrides.txt, environment.json.
+
+    Raises:
+        ConfigError: if the folder cannot be written.
+    """
+    try:
+        write_text(path / "config.yaml", yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
+        write_text(path / "overrides.txt", "".join(f"{line}\n" for line in overrides))
+        write_json(path / "environment.json", dict(environment))
+    except OSError as error:
+        raise ConfigError(
+            f"'{path}' cannot be written ({error.strerror}). Pass paths.runs=<a folder you can write to>."
+        ) from error
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read a run's config.yaml as plain Python.
+
+    Raises:
+        CheckpointError: if there is none or it is damaged.
+    """
+    try:
+        config = yaml.safe_load((path / "config.yaml").read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise CheckpointError(f"'{path}' is no run directory: its config.yaml cannot be read ({error}).") from error
+    if not isinstance(config, dict):
+        raise CheckpointError(f"'{path}' is no run directory: its config.yaml holds no mapping.")
+    return config
+
+
+def write_status(path: Path, state: str, **more: Any) -> None:
+    """Write status.json: ``running``, ``finished``, ``failed`` or ``interrupted``, with the time and whatever else."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    write_json(path / "status.json", {"state": state, "time": now, "pid": os.getpid(), **more})
+
+
+@contextmanager
+def logged_to(path: Path) -> Iterator[None]:
+    """Also write hudepth's and Lightning's log lines to this file while the block runs."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    loggers = [log, logging.getLogger("lightning.pytorch")]
+    for logger in loggers:
+        logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+        handler.close()
+
+
+def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
+    """Return what a reader needs to repeat a run: versions, git state, device, threads, seed."""
+    import torch
+
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {name: metadata.version(name) for name in PACKAGES},
+        "git": _git(),
+        "accelerator": accelerator,
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.processor() or platform.machine(),
+        "threads": torch.get_num_threads(),
+        "seed": seed,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+    }
+
+
+def _git() -> dict[str, Any] | None:
+    """Commit and dirty flag of the checkout this code runs from, None for an installed wheel."""
+    here = Path(__file__).parent
+
+    def ask(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, timeout=10, check=True
+        ).stdout.strip()
+
+    try:
+        if not ask("ls-files", Path(__file__).name):
+            return None  # a wheel inside somebody else's repository
+        return {"commit": ask("rev-parse", "HEAD"), "dirty": bool(ask("status", "--porcelain"))}
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def is_run(path: Path) -> bool:
+    """Tell whether ``path`` is a run directory."""
+    return (path / "config.yaml").is_file()
+
+
+def newest_run(runs: str | Path) -> Path:
+    """Return the run below ``runs`` that was written to last and has a checkpoint.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    root = Path(runs).expanduser()
+    found = [c.parent.parent for name in (BEST, LAST) for c in root.glob(f"*/*/{CHECKPOINTS}/{name}")]
+    if not found:
+        raise CheckpointError(
+            f"checkpoint=last: no run with a checkpoint below '{root}'. Train one with hudepth-train, "
+            "or pass checkpoint=<file or run directory>."
+        )
+    return max(found, key=lambda run: (run / CHECKPOINTS).stat().st_mtime_ns)
+
+
+def run_of(checkpoint: Path) -> Path | None:
+    """Return the run directory a checkpoint file lies in, or None for a file that was moved elsewhere."""
+    run = checkpoint.parent.parent
+    return run if checkpoint.parent.name == CHECKPOINTS and is_run(run) else None

@@ -1,0 +1,57 @@
+"""What the tasks share: from Hydra's configuration to plain Python, and from that to objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.errors import ConfigError
+from hudepth.instantiate import instantiate
+from hudepth.metrics.protocol import Protocol
+
+SOURCE_KEYS = ("root", "encoding")
+"""Keys of ``data`` that belong to the source: they stand above it because people type them."""
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """Resolve a Hydra configuration into dicts, lists and scalars: all that goes below the tasks.
+
+    Raises:
+        ConfigError: if a mandatory value is missing.
+    """
+    missing = sorted(OmegaConf.missing_keys(cfg))
+    if missing:
+        raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<value>.")
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    return {str(key): value for key, value in config.items()}
+
+
+def build_data(data: Mapping[str, Any], *, trust: list[str]) -> DepthDataModule:
+    """Build the data module that the ``data`` part of a configuration describes.
+
+    Raises:
+        ConfigError: if it cannot be built.
+    """
+    given = {key: data[key] for key in SOURCE_KEYS if key in data}
+    source = instantiate(data["source"], trust=trust, **given)
+    options = {key: value for key, value in data.items() if key not in (*SOURCE_KEYS, "source")}
+    datamodule = instantiate(options, source, trust=trust)
+    if not isinstance(datamodule, DepthDataModule):
+        raise ConfigError(f"data._target_: {type(datamodule).__name__} is no DepthDataModule.")
+    return datamodule
+
+
+def build_protocols(protocols: Mapping[str, Any], *, trust: list[str]) -> list[Protocol]:
+    """Build the test protocols of a configuration, in its order.
+
+    Raises:
+        ConfigError: if there is none, or one cannot be built.
+    """
+    built = [instantiate(protocol, trust=trust) for protocol in protocols.values() if protocol]
+    if not built:
+        raise ConfigError("protocol: none is given. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
+    return built

@@ -1,0 +1,252 @@
+"""hudepth-train: from a configuration to a run directory with a trained, tested model."""
+
+from __future__ import annotations
+
+import logging
+import os
+import traceback
+import warnings
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from lightning.pytorch import Callback, Trainer, seed_everything
+from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from omegaconf import DictConfig, OmegaConf
+
+from hudepth import run_dir
+from hudepth.callbacks import (
+    EpochLine,
+    History,
+    PanelPictures,
+    checkpoint_callbacks,
+    evenly_spaced,
+    shows_progress,
+)
+from hudepth.checkpoint import AtomicCheckpointIO, load_checkpoint
+from hudepth.console import log
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.splits import load_split, save_split
+from hudepth.errors import CheckpointError, ConfigError, HudepthError
+from hudepth.instantiate import instantiate
+from hudepth.module import DepthModule
+from hudepth.tasks.common import build_data, build_protocols, plain
+from hudepth.tasks.test import score_checkpoint
+
+RUN_ENV = "HUDEPTH_RUN"
+"""Tells the processes of a distributed run which run directory the first one made."""
+
+
+def train(cfg: DictConfig) -> float | None:
+    """Train as configured, or continue a run; then test the best checkpoint.
+
+    Args:
+        cfg: what conf/train.yaml and the command line compose to.
+
+    Returns:
+        The best value of the monitored metric.
+
+    Raises:
+        HudepthError: with one line for the user; the run's status and log say the same.
+    """
+    overrides = list(HydraConfig.get().overrides.task)
+    if cfg.resume:
+        path = Path(cfg.resume).expanduser().resolve()
+        config = resumed_config(path, overrides)
+    else:
+        config = plain(cfg)
+        path = _run_path(config)
+        environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
+        run_dir.write_start(path, config=config, overrides=overrides, environment=environment)
+    os.environ[RUN_ENV] = str(path)
+    try:
+        with run_dir.logged_to(path / "train.log"):
+            return _run(config, path, resume=bool(cfg.resume))
+    finally:
+        os.environ.pop(RUN_ENV, None)
+
+
+def _run_path(config: dict[str, Any]) -> Path:
+    if RUN_ENV in os.environ:
+        return Path(os.environ[RUN_ENV])
+    hydra = HydraConfig.get()
+    if hydra.mode == RunMode.MULTIRUN:
+        path = Path(hydra.runtime.output_dir)
+        path.mkdir(parents=True, exist_ok=True)
+        return path.resolve()
+    return run_dir.create(config["paths"]["runs"], config["name"])
+
+
+def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
+    """Return the configuration of a run to continue, with what was typed beside ``resume=`` on top.
+
+    Args:
+        path: the run directory.
+        overrides: as typed, for example ``["resume=runs/x", "trainer.max_epochs=50"]``.
+
+    Raises:
+        CheckpointError: if it is no run, or has no checkpoint to continue from.
+        ConfigError: if something typed is not a value of that run's configuration.
+    """
+    config = run_dir.read_config(path)
+    if not (path / run_dir.CHECKPOINTS / run_dir.LAST).is_file():
+        raise CheckpointError(f"resume: '{path}' has no finished epoch to continue from. Train anew, without resume=.")
+    resumed = OmegaConf.create(config)
+    for override in overrides:
+        key, _, value = override.partition("=")
+        key = key.lstrip("+")
+        if key in ("resume", "paths.runs"):
+            continue
+        if OmegaConf.select(resumed, key, default=resumed) is resumed or isinstance(config.get(key), dict):
+            raise ConfigError(
+                f"resume: '{override}' cannot be changed when a run is continued; only values that its config.yaml "
+                "has can, such as trainer.max_epochs. Start a new run for anything else."
+            )
+        OmegaConf.update(resumed, key, OmegaConf.create({"value": None}) if value == "null" else _parse(value))
+    return plain(resumed)
+
+
+def _parse(value: str) -> Any:
+    return OmegaConf.create(f"value: {value}")["value"]
+
+
+def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
+    """Fit and test inside a run directory, whose status always tells how it went."""
+    try:
+        run_dir.write_status(path, "running")
+        best = _fit(config, path, resume=resume)
+    except HudepthError as error:
+        _failed(path, str(error))
+        raise
+    except OSError as error:
+        _failed(path, str(error))
+        raise ConfigError(f"{error.strerror or error} ('{error.filename or path}'). See {path / 'train.log'}.") from error
+    except (KeyboardInterrupt, SystemExit):
+        run_dir.write_status(path, "interrupted")
+        log.info("interrupted; continue with: hudepth-train resume=%s", path)
+        raise
+    except BaseException as error:
+        _failed(path, f"{type(error).__name__}: {error}")
+        raise
+    run_dir.write_status(path, "finished", **({"best": best} if best is not None else {}))
+    return best
+
+
+def _failed(path: Path, message: str) -> None:
+    for handler in log.handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.stream.write(traceback.format_exc())
+    try:
+        run_dir.write_status(path, "failed", error=message)
+    except OSError:  # a full disk is the likely reason to be here; the message below still goes to the terminal
+        log.warning("the status in '%s' could not be written", path)
+
+
+def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
+    log.info("run directory: %s", path)
+    seed_everything(config["seed"], verbose=False)
+    trust = list(config["trust"])
+    datamodule = build_data(config["data"], trust=trust)
+    if datamodule.source.name == "rooms":
+        log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
+    build_protocols(config["protocol"], trust=trust)  # a wrong protocol should not be found after hours
+    split_file = path / "split.json"
+    if resume and split_file.exists():
+        datamodule.split = load_split(split_file, datamodule.store.records)
+    else:
+        save_split(split_file, datamodule.split, datamodule.store.records)
+    module = build_module(config, datamodule, trust=trust)
+    callbacks = _callbacks(config, path, datamodule)
+    trainer = _trainer(config, path, callbacks)
+    log.info(
+        "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d, %s, %d threads",
+        type(module.net).__name__, f"{sum(p.numel() for p in module.net.parameters()):,}", datamodule.source.name,
+        datamodule.split.kind, len(datamodule.split.train), len(datamodule.split.val), len(datamodule.split.test),
+        datamodule.batch_size, trainer.accelerator.__class__.__name__.removesuffix("Accelerator"), _threads(),
+    )  # fmt: skip
+    last = path / run_dir.CHECKPOINTS / run_dir.LAST
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*does not have many workers.*")
+        warnings.filterwarnings("ignore", ".*exists and is not empty.*")
+        warnings.filterwarnings("ignore", ".*LeafSpec.*")
+        trainer.fit(module, datamodule=datamodule, ckpt_path=last if resume else None, weights_only=True)
+    best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
+    score = best.best_model_score
+    if config["test"] and trainer.is_global_zero:
+        checkpoint = load_checkpoint(str(path))
+        score_checkpoint(checkpoint, config=config, output=path / "test", datamodule=datamodule)
+    return None if score is None else float(score)
+
+
+def _threads() -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: list[str]) -> DepthModule:
+    """Build network, loss, optimiser and schedule of a configuration into a module.
+
+    Raises:
+        HudepthError: if a part cannot be built.
+    """
+    schedule = config["schedule"]
+    scheduled = schedule and schedule.get("_target_")
+    return DepthModule(
+        instantiate(config["model"], trust=trust),
+        instantiate(config["loss"], trust=trust),
+        max_depth_m=datamodule.max_depth_m,
+        optimizer=partial(instantiate, config["optim"], trust=trust),
+        scheduler=partial(instantiate, schedule, trust=trust) if scheduled else None,
+        record={"config": config, "split": datamodule.split.summary()},
+    )
+
+
+def _callbacks(config: dict[str, Any], path: Path, datamodule: DepthDataModule) -> list[Callback]:
+    options = config["callbacks"]
+    monitor, mode = config["monitor"], config["mode"]
+    callbacks: list[Callback] = [History(path / "metrics.csv"), EpochLine(monitor)]
+    if options["panels"]:
+        callbacks.append(
+            PanelPictures(
+                path / "images",
+                datamodule.store,
+                evenly_spaced(sorted(datamodule.split.val), options["panels"]),
+                every_n_epochs=options["panels_every_n_epochs"],
+                max_depth_m=datamodule.max_depth_m,
+            )
+        )
+    if shows_progress():
+        callbacks.append(RichProgressBar(leave=False))
+    if options["early_stopping"]:
+        callbacks.append(
+            EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"])
+        )
+    callbacks += [instantiate(extra, trust=config["trust"]) for extra in options["extra"]]
+    return [*callbacks, *checkpoint_callbacks(path, monitor=monitor, mode=mode)]
+
+
+def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> Trainer:
+    options = config["logger"]
+    loggers: list[Logger] = [instantiate(extra, trust=config["trust"]) for extra in options["extra"]]
+    if options["tensorboard"]:
+        loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # its greetings; warnings still come through
+    try:
+        return Trainer(
+            **config["trainer"],
+            logger=loggers or False,
+            callbacks=callbacks,
+            plugins=[AtomicCheckpointIO()],
+            default_root_dir=path,
+            enable_model_summary=False,
+            enable_progress_bar=shows_progress(),
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,  # the data module shards by itself, exactly
+            log_every_n_steps=10,
+        )
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"trainer: {error}") from error

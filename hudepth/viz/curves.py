@@ -1,0 +1,59 @@
+"""Curves over the epochs of a run: figure 5 of the paper."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from hudepth.errors import DataError
+from hudepth.viz.panels import save_figure
+
+
+def read_history(path: Path) -> list[dict[str, float]]:
+    """Read a run's metrics.csv: one row an epoch.
+
+    Raises:
+        DataError: if it is missing or holds no epoch.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+    except (OSError, ValueError) as error:
+        raise DataError(f"'{path}' cannot be read as a history of epochs ({error}).") from error
+    if not rows:
+        raise DataError(f"'{path}' holds no finished epoch.")
+    return rows
+
+
+def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> Figure:
+    """Draw training and validation curves of the total loss and of each of its terms, a plot each.
+
+    Args:
+        history: rows with ``epoch``, ``train/<name>`` and ``val/<name>``.
+        title: above the figure.
+    """
+    names = [key.removeprefix("train/") for key in history[0] if key.startswith("train/")]
+    names.sort(key=lambda name: name != "total")
+    figure = Figure(figsize=(3.4 * len(names), 3.2), dpi=110, layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=10)
+    epochs = [row["epoch"] for row in history]
+    for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        for stage, label in (("train", "training"), ("val", "validation")):
+            axis.plot(epochs, [row.get(f"{stage}/{name}", float("nan")) for row in history], marker=".", label=label)
+        axis.set_title(f"{name} loss", fontsize=10)
+        axis.set_xlabel("epoch")
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def save_curves(path: Path, history: Sequence[Mapping[str, float]], *, title: str = "") -> None:
+    """Write :func:`draw_curves` as a PNG file."""
+    save_figure(path, draw_curves(history, title=title))

@@ -1,0 +1,146 @@
+"""Pairs without a list, in two folders and in one."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hudepth.data.sources.base import Record
+from hudepth.data.sources.folder import FolderSource
+from hudepth.errors import ConfigError, DataError
+
+RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+DEPTH = np.random.default_rng(1).uniform(0.5, 9, (6, 8)).astype(np.float32)
+BOTH = {"images": ".", "depths": ".", "encoding": "float_m"}
+
+
+def write(root: Path, *names: str) -> None:
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def refusal(source: FolderSource) -> str:
+    with pytest.raises(DataError) as caught:
+        source.records()
+    return str(caught.value)
+
+
+def test_two_folders(tmp_path: Path) -> None:
+    write(tmp_path, "images/k/10.JPG", "images/k/9.png", "images/1.jpeg", "images/notes.txt")
+    write(tmp_path, "depths/k/10.npy", "depths/k/9.TIF", "depths/1.png")
+    assert FolderSource(tmp_path, encoding="float_m").records() == [
+        Record(id="1", scene="", frame=0, image="images/1.jpeg", depth="depths/1.png"),
+        Record(id="k/9", scene="k", frame=0, image="images/k/9.png", depth="depths/k/9.TIF"),
+        Record(id="k/10", scene="k", frame=1, image="images/k/10.JPG", depth="depths/k/10.npy"),
+    ]
+
+
+@pytest.mark.parametrize(("image_suffix", "depth_suffix"), [("_rgb", "_depth"), ("", "_depth"), ("_rgb", "")])
+def test_one_folder(tmp_path: Path, image_suffix: str, depth_suffix: str) -> None:
+    for name in ("a", "b"):
+        write(tmp_path, f"s/{name}{image_suffix}.png", f"s/{name}{depth_suffix}.png")
+    source = FolderSource(tmp_path, image_suffix=image_suffix, depth_suffix=depth_suffix, **BOTH)  # type: ignore[arg-type]
+    assert source.records() == [
+        Record(
+            id=f"s/{name}",
+            scene="s",
+            frame=frame,
+            image=f"s/{name}{image_suffix}.png",
+            depth=f"s/{name}{depth_suffix}.png",
+        )
+        for frame, name in enumerate("ab")
+    ]
+
+
+@pytest.mark.parametrize("extension", [".npy", ".tif"])
+def test_reads_a_pair(tmp_path: Path, extension: str) -> None:
+    image, depth = tmp_path / "rgb/a.png", tmp_path / f"z/a{extension}"
+    write(tmp_path, "rgb/a.png", f"z/a{extension}")
+    cv2.imwrite(str(image), RGB[..., ::-1])
+    np.save(depth, DEPTH) if extension == ".npy" else cv2.imwrite(str(depth), DEPTH)
+    source = pickle.loads(pickle.dumps(FolderSource(tmp_path, images="rgb", depths="z", encoding="float_m")))
+    pair = source.read(source.records()[0])
+    np.testing.assert_array_equal(pair.image, RGB)
+    np.testing.assert_array_equal(pair.depth, DEPTH)
+    assert source.files() == [image, depth]
+
+
+def test_encoding_is_required(tmp_path: Path) -> None:
+    write(tmp_path, "images/a.jpg", "depths/a.png")
+    assert refusal(FolderSource(tmp_path)) == (
+        "data.encoding is not set, and a folder does not tell its units. "
+        "Choose one of auto, uint16_mm, uint8_10m, float_m, linear, paper_literal."
+    )
+    with pytest.raises(ConfigError, match="Did you mean 'float_m'"):
+        FolderSource(tmp_path, encoding="float").records()
+
+
+def test_unpaired(tmp_path: Path) -> None:
+    write(tmp_path, "images/a.jpg", "images/b.jpg", "images/c.jpg", "depths/a.png")
+    expects = "Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
+    source = FolderSource(tmp_path, encoding="auto")
+    assert refusal(source) == (
+        f"data.root: 2 of 3 images in '{tmp_path}' have no depth, the first is 'images/b.jpg'. {expects}"
+    )
+    write(tmp_path, "depths/b.png", "depths/c.png", "depths/x/d.npy")
+    assert refusal(source) == (
+        f"data.root: 1 of 4 depth maps in '{tmp_path}' have no image, "
+        f"the first is 'depths/x/d.npy'. {expects}"
+    )
+    write(tmp_path, "depths/a.npy")
+    assert refusal(source) == (
+        "'depths/a.npy' and 'depths/a.png' are both the depth of 'a'. Keep one of them."
+    )
+
+
+def test_roots_without_pairs(tmp_path: Path) -> None:
+    assert refusal(FolderSource(None, encoding="auto")) == (
+        "data.root is not set. Pass data.root=<folder with images and depths>, or run with data=rooms."
+    )
+    source = FolderSource(tmp_path, encoding="auto")
+    assert refusal(source) == (
+        f"data.images: no folder 'images' in '{tmp_path}'. Pass data.images=<folder within data.root>."
+    )
+    (tmp_path / "images").mkdir()
+    assert refusal(source) == (
+        f"data.depths: no folder 'depths' in '{tmp_path}'. Pass data.depths=<folder within data.root>."
+    )
+    (tmp_path / "depths").mkdir()
+    assert refusal(source) == (
+        f"data.root: no pairs in '{tmp_path}'. "
+        "Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
+    )
+
+
+def test_one_folder_needs_suffixes(tmp_path: Path) -> None:
+    write(tmp_path, "a.jpg", "a.png")
+    assert refusal(FolderSource(tmp_path, images=".", depths="./", encoding="auto")) == (
+        "data.images and data.depths are both '.', images and depth maps look alike. "
+        "Pass data.image_suffix=_rgb data.depth_suffix=_depth, as your files are named."
+    )
+
+
+def test_folders_stay_inside(tmp_path: Path) -> None:
+    (tmp_path / "depths").mkdir()
+    assert refusal(FolderSource(tmp_path, images="../x", encoding="auto")) == (
+        f"data.images: path '../x' is not inside the data folder. Use paths relative to '{tmp_path}'."
+    )
+
+
+def test_unequal_sizes(tmp_path: Path) -> None:
+    write(tmp_path, "images/a.png", "depths/a.npy")
+    cv2.imwrite(str(tmp_path / "images/a.png"), RGB)
+    np.save(tmp_path / "depths/a.npy", DEPTH.T)
+    source = FolderSource(tmp_path, encoding="float_m")
+    with pytest.raises(DataError) as caught:
+        source.read(source.records()[0])
+    assert str(caught.value) == (
+        f"'{tmp_path / 'images/a.png'}' is 8 x 6 pixels but '{tmp_path / 'depths/a.npy'}' is 6 x 8. "
+        "Both must have one size."
+    )

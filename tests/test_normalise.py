@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hudepth.normalise import IMAGENET_MEAN, IMAGENET_STD, denormalise_image, normalise_image
+
+
+def test_normalise_agrees_with_numpy() -> None:
+    image = np.random.default_rng(0).random((2, 3, 4, 5))
+    # torchvision's constants, written out: a slip in the module would cancel against itself
+    mean, std = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    expected = (image - mean[:, None, None]) / std[:, None, None]
+    np.testing.assert_allclose(normalise_image(torch.from_numpy(image)).numpy(), expected, rtol=1e-14)
+
+
+def test_denormalise_inverts_normalise() -> None:
+    image = torch.rand(2, 3, 4, 5, dtype=torch.float64)
+    torch.testing.assert_close(denormalise_image(normalise_image(image)), image, rtol=0, atol=1e-15)
+
+
+def test_statistics_are_plain_floats() -> None:
+    assert all(type(value) is float for value in (*IMAGENET_MEAN, *IMAGENET_STD))
