@@ -101,7 +101,9 @@ class EpochLine(Callback):
         done = trainer.current_epoch + 1 - self._first
         each = (time.monotonic() - self._start) / done
         left = max(0, (trainer.max_epochs or 0) - trainer.current_epoch - 1)
-        values = [f"{name} {metrics[name]:.4f}" for name in ("train/total", "val/total", *self.shown) if name in metrics]
+        values = [
+            f"{name} {metrics[name]:.4f}" for name in ("train/total", "val/total", *self.shown) if name in metrics
+        ]
         ending = f"{duration(each)} an epoch" + (f", {duration(each * left)} left" if left else "")
         log.info("epoch %d of %s: %s (%s)", trainer.current_epoch + 1, trainer.max_epochs, ", ".join(values), ending)
 
@@ -138,9 +140,7 @@ class PanelPictures(Callback):
 
 
 @torch.inference_mode()
-def make_panels(
-    module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float
-) -> list[Panel]:
+def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float) -> list[Panel]:
     """Predict some pairs of a store and return them as rows of a picture.
 
     Args:

@@ -23,7 +23,7 @@ NET_PREFIX = "net."
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint beside its place and renames it, so that a full disk or a kill never costs the previous one."""
+    """Writes a checkpoint beside its place, then renames it: a full disk or a kill never costs the previous one."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write ``checkpoint`` to ``path``, whole or not at all.
@@ -82,8 +82,12 @@ class Checkpoint:
         try:
             net.load_state_dict(self.state, assign=True)
         except RuntimeError as error:
-            own = net.state_dict()
-            unlike = [n for n in {**own, **self.state} if n not in own or n not in self.state or own[n].shape != self.state[n].shape]
+            own, given = net.state_dict(), self.state
+            unlike = [
+                name
+                for name in {**own, **given}
+                if name not in own or name not in given or own[name].shape != given[name].shape
+            ]
             raise CheckpointError(
                 f"'{self.path}' is from another model: {len(unlike)} tensors do not fit {model.get('_target_')}, "
                 f"the first is '{unlike[0] if unlike else '?'}'. Pass a checkpoint whose configuration matches its weights."
@@ -127,7 +131,9 @@ def read_plain(path: Path) -> dict[str, Any]:
             "Use a checkpoint written by hudepth-train."
         ) from error
     except Exception as error:
-        raise CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)}).") from error
+        raise CheckpointError(
+            f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)})."
+        ) from error
     if not isinstance(content, dict):
         raise CheckpointError(f"'{path}' holds no checkpoint, but a {type(content).__name__}.")
     return content
@@ -163,4 +169,3 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         epoch=int(content.get("epoch", -1)) + 1,
         state=state,
     )
-

@@ -157,8 +157,15 @@ def _config_line(error: BaseException, task: str) -> str | None:
         return f"no key '{key}'.{did_you_mean(key, known_keys(task))} See hudepth-{task} --cfg job for all keys."
     if "Could not override" in text or "missing from config" in text.lower():
         return " ".join(text.split())
-    if "LexerNoViableAlt" in text or "mismatched input" in text or "extraneous input" in text or "no viable alternative" in text:
-        return f"cannot read the command line: {text.splitlines()[0]} Quote values with special characters: 'key=\"a b\"'."
+    if (
+        "LexerNoViableAlt" in text
+        or "mismatched input" in text
+        or "extraneous input" in text
+        or "no viable alternative" in text
+    ):
+        return (
+            f"cannot read the command line: {text.splitlines()[0]} Quote values with special characters: 'key=\"a b\"'."
+        )
     return " ".join(text.split())
 
 

@@ -54,7 +54,7 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
     mean_map = torch.where(count > 0, total / count.clamp(min=1), mean)
     return {
         "mean_depth_map": ConstantDepth(mean_map.float()[None, None]),
-        "mean_depth": ConstantDepth(torch.full_like(mean_map, mean).float()[None, None]),
+        "mean_depth": ConstantDepth(mean.expand(store.size).float()[None, None]),
     }
 
 

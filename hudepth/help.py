@@ -5,7 +5,7 @@ from __future__ import annotations
 from hudepth.cli import conf_folder, options_of
 
 ABOUT = {
-    "train": "Train a monocular depth model, then test its best checkpoint. Everything goes to runs/<name>/<date_time>/.",
+    "train": "Train a monocular depth model and test its best checkpoint. All goes to runs/<name>/<date_time>/.",
     "test": "Score a checkpoint. It needs nothing but the checkpoint: model, data and split are recorded in it.",
     "data": "Prepare a data set once as a depth store, or show what is known of it.",
 }

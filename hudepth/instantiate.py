@@ -1,7 +1,7 @@
 """Turn plain configuration into objects, from trusted modules only.
 
-A configuration may come from a stranger's checkpoint, so ``_target_`` is not imported unless it lies under a prefix on
-the allow-list, and what it names must be a class that was defined there: ``hudepth.files.os.system`` is refused although
+A configuration may come from a stranger's checkpoint, so a ``_target_`` is not imported unless it lies under a prefix
+on the allow-list, and what it names must be a class that was defined there: ``hudepth.files.os.system`` is refused although
 its name starts well.
 """
 
@@ -34,7 +34,7 @@ def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), **extra: Any
     return _build(config, prefixes, args, extra)
 
 
-def _build(config: Any, prefixes: tuple[str, ...], args: tuple[Any, ...] = (), extra: Mapping[str, Any] = {}) -> Any:  # noqa: B006
+def _build(config: Any, prefixes: tuple[str, ...], args: tuple[Any, ...] = (), extra: Mapping[str, Any] = {}) -> Any:
     if isinstance(config, list):
         return [_build(item, prefixes) for item in config]
     if not isinstance(config, Mapping):

@@ -106,7 +106,8 @@ class DepthModule(LightningModule):
         store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
         names = [store.records[i].id if store else str(i) for i in index.tolist()]
         raise TrainingError(
-            f"the loss is {total.item()} in epoch {self.current_epoch}, batch {batch_idx}, of the pairs {', '.join(names)}. "
+            f"the loss is {total.item()} in epoch {self.current_epoch + 1}, batch {batch_idx}, "
+            f"of the pairs {', '.join(names)}. "
             "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
         )
 
@@ -115,7 +116,10 @@ class DepthModule(LightningModule):
         optimizer = self._make_optimizer(self.parameters())
         if self._make_scheduler is None:
             return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._make_scheduler(optimizer), "interval": "epoch"}}
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": self._make_scheduler(optimizer), "interval": "epoch"},
+        }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the configuration and the split, so that a checkpoint needs nothing beside it."""

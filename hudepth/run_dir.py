@@ -57,7 +57,9 @@ def create(parent: str | Path, name: str) -> Path:
     raise ConfigError(f"paths.runs: '{base}' holds too many runs of this second.")
 
 
-def write_start(path: Path, *, config: Mapping[str, Any], overrides: Sequence[str], environment: Mapping[str, Any]) -> None:
+def write_start(
+    path: Path, *, config: Mapping[str, Any], overrides: Sequence[str], environment: Mapping[str, Any]
+) -> None:
     """Write what is known before a run begins: config.yaml, overrides.txt, environment.json.
 
     Raises:
@@ -120,7 +122,9 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
         "packages": {name: metadata.version(name) for name in PACKAGES},
         "git": _git(),
         "accelerator": accelerator,
-        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.processor() or platform.machine(),
+        "device": torch.cuda.get_device_name()
+        if torch.cuda.is_available()
+        else platform.processor() or platform.machine(),
         "threads": torch.get_num_threads(),
         "seed": seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],

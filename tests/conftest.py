@@ -11,9 +11,7 @@ import torch
 from hypothesis import settings
 
 # pep484_tower: an int is welcome where a float is asked for, as in any YAML file
-jaxtyping.install_import_hook(
-    "hudepth", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
-)
+jaxtyping.install_import_hook("hudepth", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 torch.set_num_threads(1)
 settings.register_profile("hudepth", deadline=None, max_examples=25)  # a busy machine is no failure
 settings.load_profile("hudepth")

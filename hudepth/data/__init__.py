@@ -1,0 +1,1 @@
+"""Sources, the depth store, splits and batches."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch.utils.data import Dataset, Sampler
@@ -38,15 +39,13 @@ class StoreDataset(Dataset[RawBatch]):
         """Return the batch at these positions of the subset."""
         rows = [self.indices[position] for position in positions]
         image, depth_mm = self.store.read(rows)
-        batch = RawBatch(
-            image=torch.from_numpy(image), depth_mm=torch.from_numpy(depth_mm), index=torch.tensor(rows)
-        )
+        batch = RawBatch(image=torch.from_numpy(image), depth_mm=torch.from_numpy(depth_mm), index=torch.tensor(rows))
         if self.native:
             batch["native_depth"] = [torch.from_numpy(self.store.read_native(row))[None] for row in rows]
         return batch
 
 
-def as_is(batch: RawBatch) -> RawBatch:
+def as_is(batch: Any) -> RawBatch:
     """Collate nothing: the data set already returned a batch."""
     return batch
 

@@ -78,9 +78,7 @@ def resolve_encoding(
         return "float_m"
     if dtype == np.uint8 and auto_uint8:
         return auto_uint8
-    choices = (
-        "uint8_10m (value/255*10 m) or paper_literal (value/1000 m)" if dtype == np.uint8 else "uint16_mm"
-    )
+    choices = "uint8_10m (value/255*10 m) or paper_literal (value/1000 m)" if dtype == np.uint8 else "uint16_mm"
     raise DataError(f"{_at(where)}{dtype} depth does not tell its unit. Pass data.encoding={choices}.")
 
 
@@ -141,9 +139,7 @@ def to_metres(
     return metres
 
 
-def check_range(
-    depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str
-) -> DepthRange:
+def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str) -> DepthRange:
     """Measure the range of some depths of a set, and refuse an indoor set whose median no room has.
 
     Args:
@@ -172,7 +168,7 @@ def check_range(
         raise DataError(
             f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, "
             f"indoor sets lie in {low:g} to {high:g} m. "
-            f"Pass another data.encoding ({_others(encoding)}), or data.indoor=false."
+            f"Pass another data.encoding ({_others(encoding)}), or data.source.indoor=false."
         )
     return found
 
@@ -188,9 +184,7 @@ _TO_METRES: Mapping[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] =
 def _check_values(raw: NDArray[np.generic], name: str, where: str) -> None:
     integer, bits = raw.dtype.kind in "ui", raw.dtype.itemsize * 8
     if raw.dtype.kind not in "uif":
-        raise DataError(
-            f"{_at(where)}depth values of type {raw.dtype} are no numbers. Store integers or floats."
-        )
+        raise DataError(f"{_at(where)}depth values of type {raw.dtype} are no numbers. Store integers or floats.")
     if name == "uint16_mm" and integer and bits == 8:
         largest = int(raw.max(initial=0))
         raise DataError(

@@ -1,50 +1,25 @@
-"""Turn a source into a depth store: decode each pair once, check its units, resize, write.
-
-This module and the sources import no torch, so that worker processes start fast.
-"""
+"""Turn a source into a depth store: decode each pair once, check its units, resize, write."""
 
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-import os
-from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from filelock import FileLock
-from numpy.typing import NDArray
 
 from hudepth.console import log, track
-from hudepth.data.encoding import check_range, to_metres
+from hudepth.data.encoding import check_range
+from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres
 from hudepth.data.sources.base import Record, Source
-from hudepth.data.store import VERSION, DepthStore, StoreWriter, to_mm
+from hudepth.data.store import VERSION, DepthStore, StoreWriter
 from hudepth.errors import ConfigError, DataError
 from hudepth.files import written_whole
 
 UNIT_SAMPLES = 16
 """Pairs whose depth is checked for plausible units before the others are read."""
-POOL_FROM = 32
-"""Fewer pairs than this are prepared in this process: starting others would take longer."""
-
-
-@dataclass(frozen=True, slots=True)
-class PreparedPair:
-    """One pair, ready for the store."""
-
-    image: NDArray[np.uint8]
-    depth_mm: NDArray[np.uint16]
-    native_png: NDArray[np.uint8] | None
-    native_size: tuple[int, int]
-    range_m: tuple[float, float, float]
-    """Smallest, median and largest measured depth."""
-    valid_fraction: float
 
 
 def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Path) -> Path:
@@ -124,7 +99,7 @@ def _build(
     with written_whole(path) as part:
         writer = StoreWriter(part, size=size, native=native)
         try:
-            outcomes = _prepare_all(source, records, size, native=native, workers=workers)
+            outcomes = prepare_pairs(source, records, size, native=native, workers=workers)
             for record, outcome in track(outcomes, total=len(records), what=f"preparing {source.name}"):
                 if isinstance(outcome, str):
                     if on_error == "raise":
@@ -154,101 +129,14 @@ def _check_units(source: Source, records: Sequence[Record]) -> None:
             raw = source.read(record).depth
         except DataError:
             continue  # a bad file is dealt with in its turn; a wrong encoding is wrong for all
-        depths.append(_metres(source, record, raw))
+        depths.append(read_metres(source, record, raw))
     if any((depth > 0).any() for depth in depths):
         check_range(depths, indoor=source.indoor, encoding=source.encoding, name=source.name)
-
-
-def _metres(source: Source, record: Record, raw: NDArray[np.generic]) -> NDArray[np.float32]:
-    return to_metres(
-        raw,
-        source.encoding,
-        scale_m=record.depth_scale_m,
-        offset=record.depth_offset,
-        auto_uint8=source.auto_uint8,
-        where=record.depth or record.id,
-    )
-
-
-def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair:
-    """Decode, check and resize one pair.
-
-    Raises:
-        DataError: if it cannot be read or holds no measured depth.
-    """
-    raw = source.read(record)
-    depth_m = _metres(source, record, raw.depth)
-    measured = depth_m[depth_m > 0]
-    if not measured.size:
-        raise DataError(f"'{record.depth or record.id}': the depth is zero everywhere, nothing is measured.")
-    height, width = size
-    shrinks = raw.image.shape[0] >= height and raw.image.shape[1] >= width
-    image = cv2.resize(raw.image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    depth = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    png = cv2.imencode(".png", to_mm(depth_m), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel() if native else None
-    return PreparedPair(
-        image=image.astype(np.uint8, copy=False),
-        depth_mm=to_mm(depth.astype(np.float32, copy=False)),
-        native_png=None if png is None else png.astype(np.uint8, copy=False),
-        native_size=(depth_m.shape[0], depth_m.shape[1]),
-        range_m=(float(measured.min()), float(np.median(measured)), float(measured.max())),
-        valid_fraction=measured.size / depth_m.size,
-    )
 
 
 def _figures(pair: PreparedPair) -> PreparedPair:
     empty = np.empty(0, np.uint8)
     return PreparedPair(empty, empty.astype(np.uint16), None, pair.native_size, pair.range_m, pair.valid_fraction)
-
-
-def _prepare_all(
-    source: Source, records: Sequence[Record], size: tuple[int, int], *, native: bool, workers: int | None
-) -> Iterator[tuple[Record, PreparedPair | str]]:
-    """Yield each record with its prepared pair, or with the line that says why there is none; in order."""
-    workers = workers or len(os.sched_getaffinity(0))
-    if workers == 1 or len(records) < POOL_FROM:
-        for record in records:
-            yield record, _outcome(source, record, size, native=native)
-        return
-    # spawn: a fork would copy the threads' locks of whatever the parent has loaded
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (source, size, native)) as pool:
-        waiting: deque[tuple[Record, Future[PreparedPair | str]]] = deque()
-        try:
-            for record in records:
-                waiting.append((record, pool.submit(_work, record)))
-                if len(waiting) > 8 * workers:  # bounds the memory that finished pairs take
-                    first, future = waiting.popleft()
-                    yield first, future.result()
-            while waiting:
-                first, future = waiting.popleft()
-                yield first, future.result()
-        except BrokenProcessPool as error:
-            raise DataError(
-                f"{source.name}: a preparing process was killed (out of memory?). Pass data.prepare_workers=1."
-            ) from error
-        finally:
-            for _, future in waiting:
-                future.cancel()
-
-
-def _outcome(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair | str:
-    try:
-        return prepare_pair(source, record, size, native=native)
-    except DataError as error:
-        return str(error)
-
-
-_worker: dict[str, Any] = {}
-
-
-def _start_worker(source: Source, size: tuple[int, int], native: bool) -> None:  # noqa: FBT001
-    cv2.setNumThreads(1)  # one process per core already
-    _worker.update(source=source, size=size, native=native)
-
-
-def _work(record: Record) -> PreparedPair | str:
-    return _outcome(_worker["source"], record, _worker["size"], native=_worker["native"])
 
 
 def _info(source: Source, pairs: Sequence[PreparedPair], skipped: list[str]) -> dict[str, Any]:

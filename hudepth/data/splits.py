@@ -46,7 +46,10 @@ class Split:
 
 
 def split_counts(n: int, fractions: Sequence[float]) -> tuple[int, int, int]:
-    """Sizes of the subsets as the paper cuts them: int(f0 n), int(f1 n), the rest; 50,688 -> 35,481 / 5,068 / 10,139."""
+    """Return the sizes of the subsets as the paper cuts them: int(f0 n), int(f1 n), the rest.
+
+    50,688 pairs at 0.7 / 0.1 / 0.2 give 35,481 / 5,068 / 10,139.
+    """
     train, val = int(fractions[0] * n), int(fractions[1] * n)
     return train, val, n - train - val
 

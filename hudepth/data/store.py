@@ -126,14 +126,18 @@ class DepthStore:
         try:
             with h5py.File(self.path, "r") as file:
                 if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
-                    raise DataError(f"'{self.path}' is no depth store of version {VERSION}. Delete it and prepare again.")
+                    raise DataError(
+                        f"'{self.path}' is no depth store of version {VERSION}. Delete it and prepare again."
+                    )
                 self.info: dict[str, Any] = json.loads(file.attrs["info"])
                 self.size: tuple[int, int] = tuple(file["image"].shape[1:3])
                 columns = {field: file[f"records/{field}"].asstr()[:] for field in ("id", "scene", "split", "category")}
                 frames = file["records/frame"][:]
                 self.has_native = "native" in file
         except (OSError, KeyError, json.JSONDecodeError) as error:
-            raise DataError(f"'{self.path}' cannot be read as a depth store ({error}). Delete it and prepare again.") from error
+            raise DataError(
+                f"'{self.path}' cannot be read as a depth store ({error}). Delete it and prepare again."
+            ) from error
         self.records = [
             Record(id=i, scene=s, frame=int(f), split=p, category=c)
             for i, s, f, p, c in zip(
@@ -184,4 +188,8 @@ class DepthStore:
         ends = self._open["native/end"]
         start = int(ends[index - 1]) if index else 0
         mm = cv2.imdecode(self._open["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
-        return (mm / np.float32(MM_PER_M)).astype(np.float32)
+        if mm is None:
+            raise DataError(
+                f"'{self.path}': the truth of '{self.records[index].id}' is damaged. Delete it and prepare again."
+            )
+        return mm.astype(np.float32) / np.float32(MM_PER_M)

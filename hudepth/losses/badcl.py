@@ -204,9 +204,7 @@ class BADCL(nn.Module):
         self.boundary_sign = boundary_sign
         self.image_space = image_space
         self.image_channels = image_channels
-        self.scaling_loss = partial(
-            scaling_loss, per=scale_per, mode=scale_mode, gradient=scale_gradient, eps=eps
-        )
+        self.scaling_loss = partial(scaling_loss, per=scale_per, mode=scale_mode, gradient=scale_gradient, eps=eps)
 
     def forward(
         self,
@@ -226,9 +224,7 @@ class BADCL(nn.Module):
             valid: True where the truth is measured.
         """
         with torch.autocast(pred.device.type, enabled=False):
-            terms = self._terms(
-                full_precision(pred), full_precision(target), full_precision(image.detach()), valid
-            )
+            terms = self._terms(full_precision(pred), full_precision(target), full_precision(image.detach()), valid)
             total = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
         return LossTerms(total, terms)
 
@@ -260,6 +256,4 @@ def _check_weights(weights: dict[str, float]) -> None:
                 f"loss.{name}: weight {weight}. Use a finite number of at least 0 (0 leaves the term out)."
             )
     if not any(weights.values()):
-        raise ConfigError(
-            f"loss: {', '.join(weights)} all have weight 0. Give at least one a positive weight."
-        )
+        raise ConfigError(f"loss: {', '.join(weights)} all have weight 0. Give at least one a positive weight.")

@@ -166,9 +166,7 @@ class SILog(SingleTermLoss):
     def __init__(self, *, variance_focus: float = 0.85, factor: float = 10.0) -> None:
         super().__init__()
         if not 0 <= variance_focus <= 1:
-            raise ConfigError(
-                f"loss.variance_focus: {variance_focus} is not in [0, 1]. The usual value is 0.85."
-            )
+            raise ConfigError(f"loss.variance_focus: {variance_focus} is not in [0, 1]. The usual value is 0.85.")
         if not (math.isfinite(factor) and factor > 0):
             raise ConfigError(f"loss.factor: {factor} is not positive. The usual value is 10.")
         self.variance_focus = variance_focus

@@ -1,0 +1,1 @@
+"""Depth metrics, SSIM, and the protocols that decide what is scored."""

@@ -52,9 +52,7 @@ class DepthMetrics(Metric):
             hint = did_you_mean(str(averaging), AVERAGINGS)
             raise ConfigError(f"metrics.averaging: no choice '{averaging}'. Use 'image' or 'pooled'.{hint}")
         if not 0 <= silog_lambda <= 1:
-            raise ConfigError(
-                f"metrics.silog_lambda: {silog_lambda} is not in [0, 1]. The usual values are 1 and 0.5."
-            )
+            raise ConfigError(f"metrics.silog_lambda: {silog_lambda} is not in [0, 1]. The usual values are 1 and 0.5.")
         self.averaging = averaging
         self.silog_lambda = silog_lambda
         self.silog_factor = silog_factor
@@ -111,9 +109,7 @@ class DepthSSIM(Metric):
     def __init__(self, *, data_range: float, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         if not (math.isfinite(data_range) and data_range > 0):
-            raise ConfigError(
-                f"metrics.data_range: {data_range} is not positive. Pass the maximum depth in metres."
-            )
+            raise ConfigError(f"metrics.data_range: {data_range} is not positive. Pass the maximum depth in metres.")
         self.data_range = data_range
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("images", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")

@@ -36,7 +36,7 @@ class Protocol:
     resolution: str = "network"
     """``network``: prediction and truth at training size; ``native``: the prediction is resized bilinearly to the truth."""
     crop: Sequence[int] | None = None
-    """Rows and columns that count: [top, bottom, left, right], of an image of ``crop_size``; None for all."""
+    """Rows and columns that count, [top, bottom, left, right] in an image of ``crop_size``; None for all."""
     crop_size: Sequence[int] = (480, 640)
     """(height, width) the crop refers to; for images of another size it is scaled."""
     min_depth_m: float = 0.0
@@ -65,7 +65,9 @@ class Protocol:
                     f"protocol.{self.name}.{key}: no '{value}'.{did_you_mean(value, choices)} "
                     f"Pass one of {', '.join(choices)}."
                 )
-        if self.crop is not None and (len(self.crop) != 4 or self.crop[0] >= self.crop[1] or self.crop[2] >= self.crop[3]):
+        if self.crop is not None and (
+            len(self.crop) != 4 or self.crop[0] >= self.crop[1] or self.crop[2] >= self.crop[3]
+        ):
             raise ConfigError(f"protocol.{self.name}.crop: {list(self.crop)} is not [top,bottom,left,right].")
         if self.max_depth_m is not None and self.max_depth_m <= self.min_depth_m:
             raise ConfigError(f"protocol.{self.name}.max_depth_m: {self.max_depth_m} is not above min_depth_m.")
@@ -158,13 +160,15 @@ class Protocol:
         """
         counted = sums[sums[:, 0] > 0]
         if not len(counted):
-            raise ConfigError(f"protocol={self.name}: no pixel of {len(sums)} images counts; look at its crop and caps.")
+            raise ConfigError(
+                f"protocol={self.name}: no pixel of {len(sums)} images counts; look at its crop and caps."
+            )
         if self.averaging == "image":
             return {name: values.nanmean().item() for name, values in self.per_image(counted).items()}
         pooled = {name: value.item() for name, value in self._finish(counted.sum(dim=0)).items()}
         return {**pooled, "ssim": counted[:, -1].nanmean().item()}
 
-    def _finish(self, columns: Float[Tensor, "k *n"]) -> dict[str, Float[Tensor, "*n"]]:
+    def _finish(self, columns: Float[Tensor, k * n]) -> dict[str, Float[Tensor, "*n"]]:
         sums = dict(zip(SUM_COLUMNS, columns, strict=True))
         del sums["ssim"]
         return depth_metrics_from_sums(sums, silog_lambda=self.silog_lambda, silog_factor=self.silog_factor)

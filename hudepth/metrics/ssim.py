@@ -79,9 +79,7 @@ def ssim(
     """
     if valid is None:
         valid = torch.ones_like(target, dtype=torch.bool)
-    total, windows = ssim_sums(
-        pred, target, valid, data_range=data_range, window=window, sigma=sigma, k1=k1, k2=k2
-    )
+    total, windows = ssim_sums(pred, target, valid, data_range=data_range, window=window, sigma=sigma, k1=k1, k2=k2)
     return (total / windows).to(full_precision(pred).dtype)
 
 

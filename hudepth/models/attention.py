@@ -42,7 +42,7 @@ class TransformerBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Let every position of the map look at every other."""
-        tokens = x.flatten(2).transpose(1, 2)
+        tokens: Tensor = x.flatten(2).transpose(1, 2)
         tokens = self.norm1(tokens + self.attention(tokens, tokens, tokens, need_weights=False)[0])
         tokens = self.norm2(tokens + self.feed_forward(tokens))
         return tokens.transpose(1, 2).reshape(x.shape)

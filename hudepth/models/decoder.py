@@ -41,4 +41,5 @@ class UpBlock(nn.Module):
         x = functional.interpolate(x, scale_factor=2.0, mode=self.upsample, **align)
         x = torch.cat([x, skip], dim=1)
         x = self.relu(self.bn1(self.conv1(x)))
-        return self.relu(self.bn2(self.conv2(x)))
+        x = self.relu(self.bn2(self.conv2(x)))
+        return x

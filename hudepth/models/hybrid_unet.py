@@ -81,7 +81,8 @@ class HybridUNet(nn.Module):
         x = self.up1(x, self.attention_skip(features.layer2))
         x = self.up2(x, features.layer1)
         x = self.up3(x, features.stem)
-        return self.output(self.head(self.head_up(x)))
+        unit_depth: Tensor = self.output(self.head(self.head_up(x)))
+        return unit_depth
 
 
 def check_size(height: int, width: int) -> None:

@@ -52,7 +52,8 @@ class BasicBlock(nn.Module):
         """Return the block's output, of half the size where the stride is 2."""
         shortcut = x if self.downsample is None else self.downsample(x)
         x = self.relu(self.bn1(self.conv1(x)))
-        return self.relu(self.bn2(self.conv2(x)) + shortcut)
+        x = self.relu(self.bn2(self.conv2(x)) + shortcut)
+        return x
 
 
 class ResNet18Trunk(nn.Module):
@@ -118,7 +119,7 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         hint = did_you_mean(str(path), ["imagenet", "none"])
         raise CheckpointError(
-            f"model.weights: no file '{path}'.{hint} Pass model.weights=imagenet, none, or the path of a ResNet-18 file."
+            f"model.weights: no file '{path}'.{hint} Pass imagenet, none, or the path of a ResNet-18 file."
         )
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

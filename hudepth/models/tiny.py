@@ -30,4 +30,5 @@ class TinyUNet(nn.Module):
             ConfigError: if a side of the image is not a multiple of 16.
         """
         check_size(*image.shape[-2:])
-        return self.output(self.decode(self.relu(self.norm(self.encode(image)))))
+        unit_depth: Tensor = self.output(self.decode(self.relu(self.norm(self.encode(image)))))
+        return unit_depth

@@ -123,7 +123,9 @@ def score_checkpoint(
                 {"metrics": _finite(metrics), "images": len(indices), "protocol": protocol.stamp(), **shared},
             )
             _write_per_image(folder / "per_image.csv", protocol, sums[MODEL], store, indices)
-            print_table(metrics, title=f"{protocol.name} protocol, {len(indices)} test images of {datamodule.source.name}")
+            print_table(
+                metrics, title=f"{protocol.name} protocol, {len(indices)} test images of {datamodule.source.name}"
+            )
     count = config.get("panels", 6)
     if count and trainer.is_global_zero:
         shown = evenly_spaced(sorted(indices), count)

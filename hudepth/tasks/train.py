@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer, seed_everything
@@ -100,17 +101,15 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
         key = key.lstrip("+")
         if key in ("resume", "paths.runs"):
             continue
-        if OmegaConf.select(resumed, key, default=resumed) is resumed or isinstance(config.get(key), dict):
+        if OmegaConf.select(resumed, key, default=resumed) is resumed or OmegaConf.is_dict(
+            OmegaConf.select(resumed, key)
+        ):
             raise ConfigError(
                 f"resume: '{override}' cannot be changed when a run is continued; only values that its config.yaml "
                 "has can, such as trainer.max_epochs. Start a new run for anything else."
             )
-        OmegaConf.update(resumed, key, OmegaConf.create({"value": None}) if value == "null" else _parse(value))
+        OmegaConf.update(resumed, key, yaml.safe_load(value))
     return plain(resumed)
-
-
-def _parse(value: str) -> Any:
-    return OmegaConf.create(f"value: {value}")["value"]
 
 
 def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
@@ -123,7 +122,9 @@ def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         raise
     except OSError as error:
         _failed(path, str(error))
-        raise ConfigError(f"{error.strerror or error} ('{error.filename or path}'). See {path / 'train.log'}.") from error
+        raise ConfigError(
+            f"{error.strerror or error} ('{error.filename or path}'). See {path / 'train.log'}."
+        ) from error
     except (KeyboardInterrupt, SystemExit):
         run_dir.write_status(path, "interrupted")
         log.info("interrupted; continue with: hudepth-train resume=%s", path)
@@ -136,10 +137,9 @@ def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
 
 
 def _failed(path: Path, message: str) -> None:
-    for handler in log.handlers:
-        if isinstance(handler, logging.FileHandler):
-            handler.stream.write(traceback.format_exc())
     try:
+        with (path / "train.log").open("a", encoding="utf-8") as file:
+            file.write(traceback.format_exc())
         run_dir.write_status(path, "failed", error=message)
     except OSError:  # a full disk is the likely reason to be here; the message below still goes to the terminal
         log.warning("the status in '%s' could not be written", path)
@@ -222,9 +222,7 @@ def _callbacks(config: dict[str, Any], path: Path, datamodule: DepthDataModule) 
     if shows_progress():
         callbacks.append(RichProgressBar(leave=False))
     if options["early_stopping"]:
-        callbacks.append(
-            EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"])
-        )
+        callbacks.append(EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"]))
     callbacks += [instantiate(extra, trust=config["trust"]) for extra in options["extra"]]
     return [*callbacks, *checkpoint_callbacks(path, monitor=monitor, mode=mode)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -42,7 +43,7 @@ def draw_panels(panels: Sequence[Panel]) -> NDArray[np.uint8]:
     Returns:
         [H, W, 3] RGB.
     """
-    canvas = FigureCanvasAgg(_figure(panels))
+    canvas: Any = FigureCanvasAgg(_figure(panels))
     canvas.draw()
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
@@ -63,7 +64,8 @@ def _figure(panels: Sequence[Panel]) -> Figure:
     measured = np.concatenate([panel.truth_m[panel.truth_m > 0] for panel in panels])
     low, high = (float(measured.min()), float(measured.max())) if measured.size else (0.0, 1.0)
     errors = [np.ma.masked_where(panel.truth_m <= 0, np.abs(panel.pred_m - panel.truth_m)) for panel in panels]
-    worst = max(0.1, float(np.percentile(np.concatenate([error.compressed() for error in errors]), 99))) if measured.size else 1.0
+    wrongs = np.concatenate([error.compressed() for error in errors])
+    worst = max(0.1, float(np.percentile(wrongs, 99))) if wrongs.size else 1.0  # outliers should not darken the rest
 
     height, width = panels[0].image.shape[:2]
     figure = Figure(figsize=(10.5, 0.7 + 2.35 * height / width * len(panels)), dpi=110, layout="constrained")
@@ -72,7 +74,8 @@ def _figure(panels: Sequence[Panel]) -> Figure:
         axis.set_title(title, fontsize=10)
     for row, panel, error in zip(axes, panels, errors, strict=True):
         row[0].imshow(panel.image)
-        depth = row[1].imshow(np.ma.masked_where(panel.truth_m <= 0, panel.truth_m), cmap=DEPTH_COLOURS, vmin=low, vmax=high)
+        truth = np.ma.masked_where(panel.truth_m <= 0, panel.truth_m)
+        depth = row[1].imshow(truth, cmap=DEPTH_COLOURS, vmin=low, vmax=high)
         row[2].imshow(panel.pred_m, cmap=DEPTH_COLOURS, vmin=low, vmax=high)
         wrong = row[3].imshow(error, cmap=ERROR_COLOURS, vmin=0, vmax=worst)
         row[0].set_ylabel(panel.title, fontsize=8)

@@ -113,9 +113,7 @@ def test_auto_converts_by_dtype() -> None:
     np.testing.assert_array_equal(
         to_metres(np.full((1, 1), 51, np.uint8), "auto", auto_uint8="uint8_10m"), np.float32(2.0)
     )
-    np.testing.assert_array_equal(
-        to_metres(np.full((1, 1), 51, np.uint8), "auto", scale_m=0.1), np.float32(5.1)
-    )
+    np.testing.assert_array_equal(to_metres(np.full((1, 1), 51, np.uint8), "auto", scale_m=0.1), np.float32(5.1))
 
 
 REFUSED = [
@@ -227,11 +225,9 @@ def test_range_refuses_an_implausible_room(depth_m: float, shown: str) -> None:
         check_range(depths, indoor=True, encoding="uint16_mm", name="folder")
     assert str(caught.value) == (
         f"data.encoding=uint16_mm: 'folder' has a median depth of {shown} m, indoor sets lie in 0.3 to 20 m. "
-        "Pass another data.encoding (uint8_10m, float_m, linear, paper_literal), or data.indoor=false."
+        "Pass another data.encoding (uint8_10m, float_m, linear, paper_literal), or data.source.indoor=false."
     )
-    assert check_range(depths, indoor=False, encoding="uint16_mm", name="folder").median_m == np.float32(
-        depth_m
-    )
+    assert check_range(depths, indoor=False, encoding="uint16_mm", name="folder").median_m == np.float32(depth_m)
 
 
 def test_range_lets_the_paper_through() -> None:

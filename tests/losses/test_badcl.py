@@ -52,10 +52,7 @@ def oracle(case: Case, options: dict[str, str], eps: float = 1e-8) -> dict[str, 
     pred, target = case.pred[:, 0].double().numpy(), case.target[:, 0].double().numpy()
     image, valid = case.image.double().numpy().copy(), case.valid[:, 0].numpy()
     if options["image_space"] == "unit":
-        image = (
-            image * np.array([0.229, 0.224, 0.225])[:, None, None]
-            + np.array([0.485, 0.456, 0.406])[:, None, None]
-        )
+        image = image * np.array([0.229, 0.224, 0.225])[:, None, None] + np.array([0.485, 0.456, 0.406])[:, None, None]
     if options["image_channels"] == "grey":
         image = (0.299 * image[:, 0] + 0.587 * image[:, 1] + 0.114 * image[:, 2])[:, None]
     scales = scale_oracle(pred, target, valid, options["scale_per"], eps)
@@ -76,14 +73,10 @@ def oracle(case: Case, options: dict[str, str], eps: float = 1e-8) -> dict[str, 
             sums["scaling"] += scales[b] * abs(pred[b, y, x] - target[b, y, x])
         else:
             sums["scaling"] += abs(scales[b] * pred[b, y, x] - target[b, y, x])
-    return {
-        name: total / (pred.size if name == "smoothness" else valid.sum()) for name, total in sums.items()
-    }
+    return {name: total / (pred.size if name == "smoothness" else valid.sum()) for name, total in sums.items()}
 
 
-def scale_oracle(
-    pred: NDArray[Any], target: NDArray[Any], valid: NDArray[Any], per: str, eps: float
-) -> list[float]:
+def scale_oracle(pred: NDArray[Any], target: NDArray[Any], valid: NDArray[Any], per: str, eps: float) -> list[float]:
     if per == "batch":
         return [target[valid].sum() / (pred[valid].sum() + eps)] * len(pred)
     return [t[v].sum() / (p[v].sum() + eps) for p, t, v in zip(pred, target, valid, strict=True)]
@@ -133,9 +126,7 @@ def test_stopped_gradient_takes_the_scale_as_a_constant() -> None:
     (gradient,) = torch.autograd.grad(loss, pred)
     p, t, valid = pred.detach()[:, 0].numpy(), case.target[:, 0].numpy(), case.valid[:, 0].numpy()
     scales = np.array(scale_oracle(p, t, valid, "image", 1e-8))[:, None, None]
-    np.testing.assert_allclose(
-        gradient[:, 0].numpy(), scales * np.sign(p - t) * valid / valid.sum(), rtol=1e-9
-    )
+    np.testing.assert_allclose(gradient[:, 0].numpy(), scales * np.sign(p - t) * valid / valid.sum(), rtol=1e-9)
 
 
 def test_forward_difference_is_zero_in_the_last_column_and_row() -> None:
@@ -255,9 +246,7 @@ def test_a_weight_of_zero_leaves_the_term_out_and_the_others_alone() -> None:
         weights = {"boundary": 3.0, "smoothness": 1.2, "scaling": 1.0}
         assert set(terms) == set(full.terms) - {absent}
         assert all(terms[name].equal(full.terms[name]) for name in terms)
-        assert total.item() == pytest.approx(
-            sum(weights[name] * terms[name].item() for name in terms), rel=1e-6
-        )
+        assert total.item() == pytest.approx(sum(weights[name] * terms[name].item() for name in terms), rel=1e-6)
 
 
 def test_scaling_alone_does_not_look_at_the_image() -> None:
@@ -270,6 +259,12 @@ def test_scaling_factor_is_one_per_image_or_per_batch() -> None:
     pred, target, _, valid = make_case(dtype=torch.float32)
     assert scaling_factor(pred, target, valid).shape == (2, 1, 1, 1)
     assert scaling_factor(pred, target, valid, per="batch").shape == (1, 1, 1, 1)
+
+
+@pytest.mark.parametrize("value", [-1.0, -1e-8, 0.0])
+def test_scaling_factor_takes_a_negative_sum_for_zero(value: float) -> None:
+    pred, one = torch.full((1, 1, 1, 1), value), torch.ones(1, 1, 1, 1)
+    assert scaling_factor(pred, one, one.bool()).item() == pytest.approx(1e8)
 
 
 def test_a_copy_computes_the_same() -> None:
@@ -286,8 +281,7 @@ def test_a_copy_computes_the_same() -> None:
         ),
         (
             {"image_space": "normalized"},
-            "loss.image_space: no choice 'normalized'. Use 'unit' or 'normalised'."
-            " Did you mean 'normalised'?",
+            "loss.image_space: no choice 'normalized'. Use 'unit' or 'normalised'. Did you mean 'normalised'?",
         ),
         (
             {"image_channels": "gray"},

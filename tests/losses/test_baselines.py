@@ -19,9 +19,7 @@ from hudepth.losses.baselines import berhu_loss, silog_loss
 LOSSES: dict[str, Callable[..., nn.Module]] = {"l1": L1, "l2": L2, "berhu": BerHu, "silog": SILog}
 
 
-def make_case(
-    seed: int = 0, *, dtype: torch.dtype = torch.float64, side: int = 5
-) -> tuple[Tensor, Tensor, Tensor]:
+def make_case(seed: int = 0, *, dtype: torch.dtype = torch.float64, side: int = 5) -> tuple[Tensor, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     pred, target, chance = torch.rand(3, 2, 1, side, side, generator=generator, dtype=torch.float64)
     valid = chance > 0.3

@@ -67,9 +67,7 @@ def test_pooled_averaging_is_one_measurement_over_all_pixels() -> None:
     metric.update(*images)
     pooled = {name: total.sum() for name, total in depth_sums(*images).items()}
     expected = depth_metrics_from_sums(pooled, silog_lambda=0.5)
-    assert as_floats(metric.compute()) == pytest.approx(
-        [value.item() for value in expected.values()], rel=1e-12
-    )
+    assert as_floats(metric.compute()) == pytest.approx([value.item() for value in expected.values()], rel=1e-12)
     by_image = DepthMetrics(silog_lambda=0.5)
     by_image.update(*images)
     assert by_image.compute()["rmse"] != metric.compute()["rmse"]
@@ -108,9 +106,7 @@ def test_states_of_two_processes_add_up_to_one(kind: str) -> None:
 @pytest.mark.parametrize("kind", BUILD)
 def test_nothing_measured_is_nan(kind: str) -> None:
     pred, target, valid = make_images()
-    assert all(
-        math.isnan(value) for value in measure(BUILD[kind](), [(pred, target, torch.zeros_like(valid))])
-    )
+    assert all(math.isnan(value) for value in measure(BUILD[kind](), [(pred, target, torch.zeros_like(valid))]))
 
 
 @pytest.mark.parametrize("kind", BUILD)
@@ -144,15 +140,11 @@ def test_a_half_precision_module_still_accumulates_in_float64(kind: str) -> None
     images = make_images()
     metric = torch.nn.ModuleList([BUILD[kind]()]).to(torch.bfloat16)[0]
     assert isinstance(metric, Metric)
-    assert measure(metric, [images, images]) == pytest.approx(
-        measure(BUILD[kind](), [images, images]), rel=1e-12
-    )
+    assert measure(metric, [images, images]) == pytest.approx(measure(BUILD[kind](), [images, images]), rel=1e-12)
 
 
 def test_a_collection_names_every_metric_once_under_its_prefix() -> None:
-    collection = MetricCollection(
-        {"depth": DepthMetrics(), "ssim": DepthSSIM(data_range=10.0)}, prefix="val/"
-    )
+    collection = MetricCollection({"depth": DepthMetrics(), "ssim": DepthSSIM(data_range=10.0)}, prefix="val/")
     collection.update(*make_images())
     result = collection.compute()
     assert set(result) == {f"val/{name}" for name in (*METRIC_NAMES, "ssim")}

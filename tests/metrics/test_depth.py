@@ -32,9 +32,7 @@ def make_case(
     )
 
 
-def oracle(
-    pred: NDArray[Any], target: NDArray[Any], *, lam: float = 1.0, factor: float = 100.0
-) -> dict[str, float]:
+def oracle(pred: NDArray[Any], target: NDArray[Any], *, lam: float = 1.0, factor: float = 100.0) -> dict[str, float]:
     """The published formulas over a flat list of valid pixels, pixel by pixel in float64."""
     pairs = [(float(p), max(float(p), 1e-3), float(t)) for p, t in zip(pred, target, strict=True)]
     n = len(pairs)
@@ -61,9 +59,7 @@ def as_floats(metrics: dict[str, Tensor], image: int) -> dict[str, float]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("lam", "factor"), [(1.0, 100.0), (0.5, 1.0), (0.85, 10.0)])
 @given(seed=st.integers(0, 1000))
-def test_each_image_agrees_with_the_formulas(
-    dtype: torch.dtype, lam: float, factor: float, seed: int
-) -> None:
+def test_each_image_agrees_with_the_formulas(dtype: torch.dtype, lam: float, factor: float, seed: int) -> None:
     pred, target, valid = make_case(seed, dtype=dtype)
     metrics = depth_metrics(pred, target, valid, silog_lambda=lam, silog_factor=factor)
     assert tuple(metrics) == METRIC_NAMES

@@ -1,0 +1,1 @@
+"""Every form in which image/depth pairs come."""

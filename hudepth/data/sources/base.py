@@ -112,7 +112,5 @@ def existing_root(root: str | Path | None, *, expects: str) -> Path:
         raise DataError(f"data.root is not set. Pass data.root=<{expects}>, or run with data=rooms.")
     path = Path(root).expanduser()
     if not path.exists():
-        raise DataError(
-            f"data.root: '{path}' does not exist. Pass data.root=<{expects}>, or run with data=rooms."
-        )
+        raise DataError(f"data.root: '{path}' does not exist. Pass data.root=<{expects}>, or run with data=rooms.")
     return path

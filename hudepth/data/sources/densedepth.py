@@ -81,9 +81,7 @@ class DenseDepthSource(Source):
                 where = f"{index} line {line}"
                 record = _record(cells, split, where)
                 if record.id in lines:
-                    raise DataError(
-                        f"{where}: '{record.id}' is listed already, in {lines[record.id]}. Remove one."
-                    )
+                    raise DataError(f"{where}: '{record.id}' is listed already, in {lines[record.id]}. Remove one.")
                 lines[record.id] = f"line {line}"
                 records.append(record)
         return records
@@ -123,7 +121,7 @@ class DenseDepthSource(Source):
     def _splits(self) -> Sequence[str]:
         if self.subset not in _SUBSETS:
             raise ConfigError(
-                f"data.subset: no subset '{self.subset}'.{did_you_mean(self.subset, _SUBSETS)} "
+                f"data.source.subset: no subset '{self.subset}'.{did_you_mean(self.subset, _SUBSETS)} "
                 f"Choose one of {', '.join(_SUBSETS)}."
             )
         return ("train", "test") if self.subset == "all" else (self.subset,)
@@ -168,9 +166,7 @@ def _record(cells: Sequence[str], split: str, where: str) -> Record:
     image, depth = frames[0], frames[1]
     scene, number = image["scene"], image["number"]
     if (scene, number) != (depth["scene"], depth["number"]):
-        raise DataError(
-            f"{where}: '{image[0]}' and '{depth[0]}' are of different frames. Copy the list again."
-        )
+        raise DataError(f"{where}: '{image[0]}' and '{depth[0]}' are of different frames. Copy the list again.")
     return Record(
         id=f"{scene or split}/{number}",
         scene=scene,
@@ -201,6 +197,4 @@ def _member(archive: zipfile.ZipFile, name: str, *, where: str) -> bytes:
             raise zipfile.BadZipFile  # zipfile does not bound what the other methods unpack
         return archive.read(member)
     except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError, OSError):
-        raise DataError(
-            f"{where}: cannot be unpacked, the zip file is damaged. Copy the zip file again."
-        ) from None
+        raise DataError(f"{where}: cannot be unpacked, the zip file is damaged. Copy the zip file again.") from None

@@ -66,9 +66,7 @@ def inside(root: Path, name: str, *, where: str) -> Path:
     windows = PureWindowsPath(name)
     parts = {*PurePosixPath(name).parts, *windows.parts}
     if not name or "\0" in name or name.startswith("/") or windows.anchor or ".." in parts:
-        raise DataError(
-            f"{where}: path {name!r} is not inside the data folder. Use paths relative to '{root}'."
-        )
+        raise DataError(f"{where}: path {name!r} is not inside the data folder. Use paths relative to '{root}'.")
     return root / name
 
 
@@ -142,15 +140,11 @@ def read_depth(source: Path | bytes, *, where: str = "") -> NDArray[np.generic]:
     if raw.ndim == 3 and raw.shape[2] == 3 and (raw == raw[..., :1]).all():
         raw = np.ascontiguousarray(raw[..., 0])  # grey saved as RGB
     if raw.ndim != 2:
-        raise DataError(
-            f"{where}: {raw.shape[2]} channels that differ are a picture, not depth. Store one channel."
-        )
+        raise DataError(f"{where}: {raw.shape[2]} channels that differ are a picture, not depth. Store one channel.")
     return raw
 
 
-def make_pair(
-    image: NDArray[np.uint8], depth: NDArray[np.generic], *, image_where: str, depth_where: str
-) -> RawPair:
+def make_pair(image: NDArray[np.uint8], depth: NDArray[np.generic], *, image_where: str, depth_where: str) -> RawPair:
     """Join an image and its depth.
 
     Raises:
@@ -182,8 +176,7 @@ def check_pixels(height: int, width: int, *, where: str) -> None:
     """
     if not 0 < height * width <= MAX_PIXELS:
         raise DataError(
-            f"{where}: {width} x {height} pixels, allowed are 1 to {MAX_PIXELS // 10**6} million. "
-            "Resize the file."
+            f"{where}: {width} x {height} pixels, allowed are 1 to {MAX_PIXELS // 10**6} million. Resize the file."
         )
 
 
@@ -210,21 +203,15 @@ def _read_npy(path: Path, where: str) -> NDArray[np.generic]:
     try:  # open_memmap reads the header alone, refuses pickles, and finds files that are cut short
         mapped = np.lib.format.open_memmap(path, mode="r")
     except (ValueError, OSError, OverflowError, TypeError, SyntaxError, EOFError):
-        raise DataError(
-            f"{where}: not a complete .npy array of plain numbers. Save it with numpy.save."
-        ) from None
+        raise DataError(f"{where}: not a complete .npy array of plain numbers. Save it with numpy.save.") from None
     if mapped.ndim != 2 or mapped.dtype.kind not in "uif":
-        raise DataError(
-            f"{where}: {mapped.dtype} array of shape {mapped.shape}. Save one number per pixel, as [H, W]."
-        )
+        raise DataError(f"{where}: {mapped.dtype} array of shape {mapped.shape}. Save one number per pixel, as [H, W].")
     check_pixels(*mapped.shape, where=where)
     return np.array(mapped, dtype=mapped.dtype.newbyteorder("="), order="C", subok=False)
 
 
 def _check_file(path: Path) -> None:
     if not path.is_file():
-        raise DataError(f"no file '{path}'. Copy it there, or take the pair off the list.")
+        raise DataError(f"no file '{path}'. Copy it there, or take it off the list.")
     if path.stat().st_size > MAX_FILE_BYTES:
-        raise DataError(
-            f"'{path}': larger than {MAX_FILE_BYTES >> 20} MiB. It cannot be one depth map or list."
-        )
+        raise DataError(f"'{path}': larger than {MAX_FILE_BYTES >> 20} MiB. It cannot be one depth map or list.")

@@ -63,8 +63,7 @@ class FolderSource(Source):
         root = self._root()
         if not self.encoding:
             raise DataError(
-                "data.encoding is not set, and a folder does not tell its units. "
-                f"Choose one of {', '.join(ENCODINGS)}."
+                f"data.encoding is not set, and a folder does not tell its units. Choose one of {', '.join(ENCODINGS)}."
             )
         check_encoding(self.encoding)
         images, depths = self._named(root)
@@ -107,15 +106,14 @@ class FolderSource(Source):
         shared = PurePosixPath(self.images) == PurePosixPath(self.depths)
         if shared and self.image_suffix == self.depth_suffix:
             raise DataError(
-                f"data.images and data.depths are both '{self.images}', images and depth maps look alike. "
-                "Pass data.image_suffix=_rgb data.depth_suffix=_depth, as your files are named."
+                f"data.source.images and data.source.depths are both '{self.images}', "
+                "images and depth maps look alike. "
+                "Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as your files are named."
             )
         images = self._keys(root, self.images, self.image_suffix, IMAGE_SUFFIXES, what="images")
         depths = self._keys(root, self.depths, self.depth_suffix, DEPTH_SUFFIXES, what="depths")
         if shared:  # where one suffix ends with the other, the longer one decides
-            longer, shorter = (
-                (depths, images) if len(self.depth_suffix) > len(self.image_suffix) else (images, depths)
-            )
+            longer, shorter = (depths, images) if len(self.depth_suffix) > len(self.image_suffix) else (images, depths)
             taken = {path for _, path in longer}
             shorter[:] = [(key, path) for key, path in shorter if path not in taken]
         return _by_key(images, what="image"), _by_key(depths, what="depth")
@@ -123,10 +121,11 @@ class FolderSource(Source):
     def _keys(
         self, root: Path, folder: str, suffix: str, extensions: Sequence[str], *, what: str
     ) -> list[tuple[str, str]]:
-        base = inside(root, folder, where=f"data.{what}")
+        base = inside(root, folder, where=f"data.source.{what}")
         if not base.is_dir():
             raise DataError(
-                f"data.{what}: no folder '{folder}' in '{root}'. Pass data.{what}=<folder within data.root>."
+                f"data.source.{what}: no folder '{folder}' in '{root}'. "
+                f"Pass data.source.{what}=<folder within data.root>."
             )
         return [
             (str(path.with_suffix("")).removesuffix(suffix), str(PurePosixPath(folder) / path))

@@ -84,9 +84,7 @@ class ManifestSource(Source):
             row = {column: cell.strip() for column, cell in zip(header, cells, strict=True)}
             record = self._record(row, folder, frames, where)
             if record.id in lines:
-                raise DataError(
-                    f"{where}: id '{record.id}' is taken by line {lines[record.id]}. Make ids unique."
-                )
+                raise DataError(f"{where}: id '{record.id}' is taken by line {lines[record.id]}. Make ids unique.")
             lines[record.id] = line
             records.append(record)
         if not records:

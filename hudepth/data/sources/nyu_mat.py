@@ -71,7 +71,15 @@ class NyuMatSource(Source):
             seen[scene] = seen.get(scene, -1) + 1
             category = category_of(scene)
             records.append(
-                Record(id=f"{index:05d}", scene=scene, frame=seen[scene], split=split, category=category)
+                Record(
+                    id=f"{index:05d}",
+                    scene=scene,
+                    frame=seen[scene],
+                    split=split,
+                    category=category,
+                    image=f"images/{index:05d}",
+                    depth=f"{self.depth}/{index:05d}",
+                )
             )
         return records
 
@@ -98,7 +106,7 @@ class NyuMatSource(Source):
         """Return the data file, and the split if there is one.
 
         Raises:
-            DataError: if the data file is missing.
+            DataError: if the data file is missing, or a split that was asked for.
         """
         path = self._path()
         splits = self._splits_path(path)
@@ -109,8 +117,7 @@ class NyuMatSource(Source):
         path = root / _FILE if root.is_dir() else root
         if not path.is_file():
             raise DataError(
-                f"data.root: no file '{_FILE}' in '{root}'. "
-                f"Pass data.root=<path of {_FILE}>, or run with data=rooms."
+                f"data.root: no file '{_FILE}' in '{root}'. Pass data.root=<path of {_FILE}>, or run with data=rooms."
             )
         return path
 
@@ -120,14 +127,17 @@ class NyuMatSource(Source):
     def _depths(self, path: Path) -> h5py.Dataset:
         if self.depth not in _DEPTHS:
             raise ConfigError(
-                f"data.depth: no depth '{self.depth}'.{did_you_mean(self.depth, _DEPTHS)} "
+                f"data.source.depth: no depth '{self.depth}'.{did_you_mean(self.depth, _DEPTHS)} "
                 f"Choose one of {', '.join(_DEPTHS)}."
             )
         return _dataset(self._handle.get(path), self.depth, "f", ndim=3, path=path)
 
     def _splits_path(self, path: Path) -> Path | None:
         if self.splits is not None:
-            return Path(self.splits).expanduser()
+            given = Path(self.splits).expanduser()
+            if not given.is_file():
+                raise DataError(f"data.source.splits: no file '{given}'. Use NYU's own splits.mat.")
+            return given
         beside = path.with_name(_SPLITS)
         return beside if beside.is_file() else None
 
@@ -141,13 +151,13 @@ class NyuMatSource(Source):
             if f"{split}Ndxs" not in numbers:
                 raise DataError(
                     f"'{source}': no variable {split}Ndxs, found {', '.join(numbers) or 'nothing'}. "
-                    "Pass data.splits=<path of NYU's splits.mat>."
+                    "Use NYU's own splits.mat."
                 )
             for number in numbers[f"{split}Ndxs"].ravel().tolist():
                 if not (1 <= number <= count and number == int(number)) or splits[int(number) - 1]:
                     raise DataError(
                         f"'{source}': {split}Ndxs names image {number:g}, listed twice or not one of "
-                        f"1 to {count}. Pass data.splits=<path of NYU's splits.mat>."
+                        f"1 to {count}. Use NYU's own splits.mat."
                     )
                 splits[int(number) - 1] = split
         return splits
@@ -171,9 +181,7 @@ def _dataset(file: h5py.File, name: str, kind: str, *, ndim: int, path: Path) ->
             f"'{path}': '{name}' is {found.dtype} of shape {found.shape}. Pass data.root=<path of {_FILE}>."
         )
     check_pixels(found.shape[-1], found.shape[-2], where=f"'{path}' {name}")
-    if (
-        found.chunks and np.prod(found.chunks, dtype=float) > 3 * MAX_PIXELS
-    ):  # a chunk is decompressed as a whole
+    if found.chunks and np.prod(found.chunks, dtype=float) > 3 * MAX_PIXELS:  # a chunk is decompressed as a whole
         raise DataError(f"'{path}': '{name}' has chunks of {found.chunks} values. Repack the file.")
     return found
 

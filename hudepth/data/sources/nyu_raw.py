@@ -52,8 +52,7 @@ class NyuRawSource(Source):
             elif depth := _DEPTH.fullmatch(path.name):
                 add_unique(depths, f"{scene}/{depth[1]}", str(path), what="depth")
         return [
-            _record(key, image, depth)
-            for key, image, depth in pair_up(images, depths, root=root, expects=_EXPECTS)
+            _record(key, image, depth) for key, image, depth in pair_up(images, depths, root=root, expects=_EXPECTS)
         ]
 
     def read(self, record: Record) -> RawPair:
@@ -79,6 +78,4 @@ class NyuRawSource(Source):
 
 def _record(key: str, image: str, depth: str) -> Record:
     scene, number = key.rsplit("/", 1)
-    return Record(
-        id=key, scene=scene, frame=int(number), category=category_of(scene), image=image, depth=depth
-    )
+    return Record(id=key, scene=scene, frame=int(number), category=category_of(scene), image=image, depth=depth)

@@ -67,16 +67,12 @@ def nyu_intrinsics(height: int, width: int) -> Intrinsics:
     view stays the same, whatever the aspect ratio.
     """
     sx, sy = width / _NYU_WIDTH, height / _NYU_HEIGHT
-    return Intrinsics(
-        fx=_NYU_FX * sx, fy=_NYU_FY * sy, cx=(_NYU_CX + 0.5) * sx - 0.5, cy=(_NYU_CY + 0.5) * sy - 0.5
-    )
+    return Intrinsics(fx=_NYU_FX * sx, fy=_NYU_FY * sy, cx=(_NYU_CX + 0.5) * sx - 0.5, cy=(_NYU_CY + 0.5) * sy - 0.5)
 
 
 def camera_axes(*, yaw: float, pitch: float, roll: float) -> F64:
     """Return [3, 3] rows right, down, forward; angles [rad]; forward is (sin yaw, 0, cos yaw) if level."""
-    forward = np.array(
-        [np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)], dtype=np.float64
-    )
+    forward = np.array([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)], dtype=np.float64)
     level = np.array([-np.cos(yaw), 0.0, np.sin(yaw)])
     below = np.cross(forward, level)
     right = np.cos(roll) * level + np.sin(roll) * below
@@ -175,28 +171,28 @@ def _screen_rectangles(view: View, solids: Solids) -> list[tuple[int, slice, sli
 def _solid_interval(kind: np.int8, start: F64, components: F64, xs: F32, ys: F32) -> tuple[Float, Float]:
     """Return [h, w] depths between which each ray is inside a solid; near > far where it misses."""
     if kind == BOX:
-        return _inside_slabs(start, [_directions(component, xs, ys) for component in components])
+        near, far = _inside_slab(start[0], _directions(components[0], xs, ys))
+        for axis in (1, 2):
+            enter, leave = _inside_slab(start[axis], _directions(components[axis], xs, ys))
+            np.maximum(near, enter, out=near)
+            np.minimum(far, leave, out=far)
+        return near, far
     # float64 for round solids: in float32 the discriminant of a thin lamp pole loses half its digits.
     x, y = xs.astype(np.float64), ys.astype(np.float64)[:, None]
     directions = [x * right + y * down + forward for right, down, forward in components]
     if kind == ELLIPSOID:
         return _inside_quadric(start, directions)
     near, far = _inside_quadric(start[[0, 2]], [directions[0], directions[2]])
-    cap_near, cap_far = _inside_slabs(start[1:2], [directions[1] + 1e-20])
-    return np.maximum(near, cap_near), np.minimum(far, cap_far)
+    enter, leave = _inside_slab(start[1], directions[1] + 1e-20)
+    return np.maximum(near, enter), np.minimum(far, leave)
 
 
-def _inside_slabs(start: F64, directions: list[Float]) -> tuple[Float, Float]:
-    """Return where rays enter and leave |coordinate| <= 1 for all coordinates; overwrites ``directions``."""
-    near: Float = np.full_like(directions[0], -np.inf)
-    far: Float = np.full_like(directions[0], np.inf)
-    for origin, direction in zip(start, directions, strict=True):
-        inverse = np.reciprocal(direction, out=direction)
-        middle = inverse * direction.dtype.type(-origin)
-        reach = np.abs(inverse, out=inverse)
-        np.maximum(near, middle - reach, out=near)
-        np.minimum(far, np.add(middle, reach, out=middle), out=far)
-    return near, far
+def _inside_slab(start: float, direction: Float) -> tuple[Float, Float]:
+    """Return where rays enter and leave |coordinate| <= 1; overwrites ``direction``."""
+    inverse = np.reciprocal(direction, out=direction)
+    middle = inverse * direction.dtype.type(-start)
+    reach = np.abs(inverse, out=inverse)
+    return middle - reach, np.add(middle, reach, out=middle)
 
 
 def _inside_quadric(start: F64, directions: list[Float]) -> tuple[Float, Float]:

@@ -79,11 +79,7 @@ class RoomsSource(Source):
 
     def records(self) -> Sequence[Record]:
         """List all frames, scene by scene; nothing is rendered."""
-        return [
-            self._record(scene, frame)
-            for scene in range(self.scenes)
-            for frame in range(self.frames_per_scene)
-        ]
+        return [self._record(scene, frame) for scene in range(self.scenes) for frame in range(self.frames_per_scene)]
 
     def read(self, record: Record) -> RawPair:
         """Render one frame: image [H, W, 3] uint8 RGB, depth [H, W] float32 z-depth [m], 0 only in holes.
@@ -120,15 +116,13 @@ class RoomsSource(Source):
         known = scene < self.scenes and 0 <= record.frame < self.frames_per_scene
         if not known or record.id != self._record(scene, record.frame).id:
             raise DataError(
-                f"rooms: no frame '{record.id}' among {self.scenes} scenes of {self.frames_per_scene} frames. "
+                f"rooms: no frame '{record.id}' in {self.scenes} scenes of {self.frames_per_scene} frames. "
                 "Pass a record that records() of the same source returned."
             )
         return scene
 
 
-def kinect_holes(
-    depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
+def kinect_holes(depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return where a Kinect would measure nothing, [H, W].
 
     Args:

@@ -128,8 +128,6 @@ def television(rng: Rng) -> Piece:
     h, half = piece.parts[2].y[1], rng.uniform(0.45, 0.6)
     parts = [part for part in piece.parts if part.y[0] < h - 1e-6]
     parts.append(Part("dark", (-half, half), (h + 0.08, h + 0.08 + half * 1.15), (0.12, 0.17)))
-    parts.append(
-        Part("screen", (-half + 0.03, half - 0.03), (h + 0.11, h + 0.05 + half * 1.15), (0.17, 0.172))
-    )
+    parts.append(Part("screen", (-half + 0.03, half - 0.03), (h + 0.11, h + 0.05 + half * 1.15), (0.17, 0.172)))
     parts.append(Part("dark", (-0.2, 0.2), (h, h + 0.1), (0.1, 0.2)))
     return Piece(piece.width, piece.depth, parts)

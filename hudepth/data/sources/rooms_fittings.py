@@ -66,9 +66,7 @@ def window(rng: Rng) -> Piece:
 def picture(rng: Rng) -> Piece:
     """A framed picture."""
     w, h, y = rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.7), rng.uniform(1.45, 1.65)
-    frame = Part(
-        str(rng.choice(["wood", "dark", "white"])), (-w / 2, w / 2), (y - h / 2, y + h / 2), (0, 0.025)
-    )
+    frame = Part(str(rng.choice(["wood", "dark", "white"])), (-w / 2, w / 2), (y - h / 2, y + h / 2), (0, 0.025))
     inner = Part(
         str(rng.choice(["painting", "poster"])),
         (-w / 2 + 0.04, w / 2 - 0.04),

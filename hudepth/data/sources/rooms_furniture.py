@@ -82,9 +82,7 @@ def table(rng: Rng, *, height: float = 0.74, width: Span = (1.1, 1.8), depth: Sp
 def coffee_table(rng: Rng) -> Piece:
     """A low table with a shelf under its top."""
     piece = table(rng, height=rng.uniform(0.38, 0.46), width=(0.8, 1.2), depth=(0.5, 0.65))
-    shelf = Part(
-        "wood", (-piece.width / 2 + 0.08, piece.width / 2 - 0.08), (0.12, 0.14), (0.08, piece.depth - 0.08)
-    )
+    shelf = Part("wood", (-piece.width / 2 + 0.08, piece.width / 2 - 0.08), (0.12, 0.14), (0.08, piece.depth - 0.08))
     return Piece(piece.width, piece.depth, [*piece.parts, shelf])
 
 
@@ -118,9 +116,7 @@ def sofa(rng: Rng) -> Piece:
         Part("fabric", (-w / 2, w / 2), (0.06, 0.28), (0, d - 0.03)),
         Part("fabric", (-w / 2, w / 2), (0.28, 0.78), (0, 0.2)),
     ]
-    parts += [
-        Part("fabric", x, (0.28, 0.6), (0.2, d)) for x in ((-w / 2, -w / 2 + arm), (w / 2 - arm, w / 2))
-    ]
+    parts += [Part("fabric", x, (0.28, 0.6), (0.2, d)) for x in ((-w / 2, -w / 2 + arm), (w / 2 - arm, w / 2))]
     edges = np.linspace(-w / 2 + arm, w / 2 - arm, n + 1)
     for left, right in pairwise(edges):
         parts.append(Part("fabric", (left + 0.01, right - 0.01), (0.28, 0.43), (0.2, d)))
@@ -141,10 +137,7 @@ def bed(rng: Rng) -> Piece:
         Part("accent1", (-w / 2 - 0.015, w / 2 + 0.015), (0.26, top + 0.06), (d * 0.36, d * 0.52)),
     ]
     middles = [0.0] if w < 1.3 else [-w / 4, w / 4]
-    parts += [
-        Part("pillow", (x - 0.33, x + 0.33), (top - 0.06, top + 0.16), (0.1, 0.52), ELLIPSOID)
-        for x in middles
-    ]
+    parts += [Part("pillow", (x - 0.33, x + 0.33), (top - 0.06, top + 0.16), (0.1, 0.52), ELLIPSOID) for x in middles]
     return Piece(w, d, parts)
 
 
@@ -155,19 +148,14 @@ def desk(rng: Rng) -> Piece:
     parts = [
         Part("wood", (-w / 2, w / 2), (0.71, 0.74), (0, d)),
         Part("wood", (x - 0.2, x + 0.2), (0.02, 0.71), (0.05, d - 0.06)),
-        *(
-            Part("panel", (x - 0.19, x + 0.19), (low, low + 0.2), (d - 0.06, d - 0.04))
-            for low in (0.06, 0.27, 0.48)
-        ),
+        *(Part("panel", (x - 0.19, x + 0.19), (low, low + 0.2), (d - 0.06, d - 0.04)) for low in (0.06, 0.27, 0.48)),
         Part("dark", (-0.28, 0.28), (0.86, 1.2), (0.2, 0.23)),
         Part("screen", (-0.26, 0.26), (0.88, 1.18), (0.23, 0.235)),
         Part("dark", (-0.03, 0.03), (0.74, 0.9), (0.17, 0.2)),
         Part("dark", (-0.12, 0.12), (0.74, 0.755), (0.1, 0.28)),
         Part("dark", (-0.22, 0.22), (0.74, 0.76), (d - 0.28, d - 0.14)),
     ]
-    parts += [
-        Part("metal", (-x - 0.02, -x + 0.02), (0, 0.71), z) for z in ((0.05, 0.09), (d - 0.1, d - 0.06))
-    ]
+    parts += [Part("metal", (-x - 0.02, -x + 0.02), (0, 0.71), z) for z in ((0.05, 0.09), (d - 0.1, d - 0.06))]
     parts += clutter(rng, (0.32, w / 2), (0.1, d - 0.1), 0.74, most=2)
     seat = [part._replace(z=(d + 0.42 - part.z[1], d + 0.42 - part.z[0])) for part in office_chair(rng).parts]
     return Piece(w, d + 0.45, parts + seat)

@@ -42,7 +42,7 @@ def noise(u: F32, v: F32) -> F32:
     """Look fractal noise up; it repeats every 512 units."""
     i = u.astype(np.int32) & (_TABLE - 1)
     j = v.astype(np.int32) & (_TABLE - 1)
-    values: F32 = _noise_table()[j, i]
+    values: F32 = _noise_table().ravel()[j * _TABLE + i]
     return values
 
 

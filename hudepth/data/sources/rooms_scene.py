@@ -34,9 +34,7 @@ class CameraPath(NamedTuple):
         """Return origin [3] in metres and axes [3, 3] of a frame."""
         rate = np.array([0.23, 0.31, 0.19, 0.21, 0.53, 0.71])  # radians a frame; neighbours see much the same
         wave = np.sin(rate * frame + self.phase)
-        axes = camera_axes(
-            yaw=self.yaw + 0.5 * wave[3], pitch=self.pitch + 0.05 * wave[4], roll=0.04 * wave[5]
-        )
+        axes = camera_axes(yaw=self.yaw + 0.5 * wave[3], pitch=self.pitch + 0.05 * wave[4], roll=0.04 * wave[5])
         return self.centre + self.sway * wave[:3], axes
 
 
@@ -56,8 +54,7 @@ class _Furnisher:
         short = rng.uniform(3.0, min(5.0, np.sqrt(96 - long**2)))  # keeps every depth below 10 m
         x, z = (long, short) if rng.random() < 0.5 else (short, long)
         self.size = np.array([x, rng.uniform(2.4, 2.9), z])
-        self.low: list[F64] = []
-        self.high: list[F64] = []
+        self.low, self.high = np.empty((0, 3)), np.empty((0, 3))
         self.placed: list[tuple[Part, float, float, float]] = []
 
     def put(self, piece: Piece, x: float, z: float, yaw: float, *, gap: float = 0.03) -> bool:
@@ -68,14 +65,10 @@ class _Furnisher:
         bottom, top = min(part.y[0] for part in piece.parts), max(part.y[1] for part in piece.parts)
         low = np.array([middle[0] - reach[0], bottom, middle[1] - reach[1]])
         high = np.array([middle[0] + reach[0], top, middle[1] + reach[1]])
-        if (low < -1e-6).any() or (high > self.size + 1e-6).any():
+        outside = (low < -1e-6).any() or (high > self.size + 1e-6).any()
+        if outside or ((low - gap < self.high) & (high + gap > self.low)).all(1).any():
             return False
-        if any(
-            (low - gap < h).all() and (high + gap > b).all() for b, h in zip(self.low, self.high, strict=True)
-        ):
-            return False
-        self.low.append(low)
-        self.high.append(high)
+        self.low, self.high = np.vstack([self.low, low]), np.vstack([self.high, high])
         self.add(piece, x, z, yaw)
         return True
 
@@ -92,8 +85,7 @@ class _Furnisher:
     def put_at_wall(self, piece: Piece, *, tries: int = 12) -> bool:
         """Place a piece with its back to any wall."""
         return any(
-            self.put(piece, *self.at_wall(int(self.rng.integers(4)), self.rng.uniform(0, 1)))
-            for _ in range(tries)
+            self.put(piece, *self.at_wall(int(self.rng.integers(4)), self.rng.uniform(0, 1))) for _ in range(tries)
         )
 
     def put_free(self, piece: Piece, *, tries: int = 12) -> bool:
@@ -107,18 +99,17 @@ class _Furnisher:
 
     def covered(self) -> float:
         """Fraction of the floor that furniture stands on."""
-        area = sum(
-            float((h - b)[[0, 2]].prod()) for b, h in zip(self.low, self.high, strict=True) if b[1] < 0.2
-        )
-        return area / float(self.size[[0, 2]].prod())
+        area = (self.high - self.low)[:, [0, 2]].prod(1)
+        return float(area[self.low[:, 1] < 0.2].sum() / self.size[[0, 2]].prod())
 
-    def clearance(self, x: float, z: float) -> float:
-        """Distance from a place on the floor plan to the nearest wall or piece [m], negative inside one."""
-        gaps = [x, self.size[0] - x, z, self.size[2] - z]
-        gaps += [
-            max(b[0] - x, x - h[0], b[2] - z, z - h[2]) for b, h in zip(self.low, self.high, strict=True)
-        ]
-        return float(min(gaps))
+    def clearance(self, places: F64) -> F64:
+        """Distance [n] from places x, z [n, 2] to the nearest wall or piece [m], or less; negative inside one."""
+        plan = [0, 2]
+        walls = np.minimum(places, self.size[plan] - places).min(1)
+        at = places[:, None]
+        pieces = np.maximum(self.low[:, plan] - at, at - self.high[:, plan]).max(2).min(1, initial=np.inf)
+        gaps: F64 = np.minimum(walls, pieces)
+        return gaps
 
     def solids(self, names: list[str]) -> tuple[Solids, list[int]]:
         """Return all parts in world coordinates, and each one's material as an index into ``names``."""
@@ -162,15 +153,16 @@ def _furnish(room: _Furnisher, category: str) -> None:
 
 
 def _choose_path(room: _Furnisher, solids: Solids) -> CameraPath:
-    """Take the place and direction that show most furniture, at NYU's distances."""
+    """Of a few places and directions, take the one that shows most furniture near a distance usual in NYU."""
     rng, size = room.rng, room.size
+    distance_m = rng.uniform(1.8, 3.6)
     best, path = -np.inf, None
     places = rng.uniform(0.05, 0.95, (160, 2)) * size[[0, 2]]
-    gaps = np.array([room.clearance(*place) for place in places])
+    gaps = room.clearance(places)
     roomy = np.flatnonzero(gaps > _WALL_CLEARANCE_M)
-    large = solids.half.max(1) > 0.12
+    large = solids.half.max(1) > 0.2
     outline = Solids(*(values[large] for values in solids))
-    for i in roomy[:8] if roomy.size else [int(gaps.argmax())]:
+    for i in roomy[:6] if roomy.size else [int(gaps.argmax())]:
         x, z = places[i]
         away = np.arctan2(size[0] / 2 - x, size[2] / 2 - z) + rng.normal(0, 0.4)
         sway = min(max(gaps[i] - 0.25, 0.0), 0.5) / np.sqrt(2)
@@ -181,18 +173,18 @@ def _choose_path(room: _Furnisher, solids: Solids) -> CameraPath:
             yaw=float(away),
             pitch=float(rng.uniform(-0.28, -0.08)),
         )
-        score = min(_score(candidate, frame, size, outline) for frame in (0, 4))
+        score = min(_score(candidate.pose(frame), size, outline, distance_m=distance_m) for frame in (0, 4))
         if score > best:
             best, path = score, candidate
     assert path is not None
     return path
 
 
-def _score(path: CameraPath, frame: int, size: F64, solids: Solids) -> float:
-    depth, surface = trace(pinhole_view(*path.pose(frame), height=12, width=16), size, solids)
+def _score(pose: tuple[F64, F64], size: F64, solids: Solids, *, distance_m: float) -> float:
+    depth, surface = trace(pinhole_view(*pose, height=12, width=16), size, solids)
     blocked = float((depth < 0.9).mean())
-    variety = len(np.unique(surface)) / 20
-    return variety - 6 * blocked - abs(float(np.median(depth)) - 2.7)
+    variety = len(np.unique(surface)) / 15
+    return variety - 6 * blocked - abs(float(np.median(depth)) - distance_m)
 
 
 def _lights(rng: Rng, size: F64) -> tuple[Light, Light, F64]:
@@ -210,9 +202,8 @@ def _lights(rng: Rng, size: F64) -> tuple[Light, Light, F64]:
 def build_room(seed: int, scene: int) -> Room:
     """Furnish room number ``scene``; the same on every call, in every process."""
     category = CATEGORIES[scene % len(CATEGORIES)]
-    rng = np.random.default_rng(
-        np.random.SeedSequence([seed, scene], spawn_key=(0,))
-    )  # apart from the frames' own
+    # spawn_key: without it the stream would be frame 0's, since SeedSequence pads its entropy with zeros.
+    rng = np.random.default_rng(np.random.SeedSequence([seed, scene], spawn_key=(0,)))
     room = _Furnisher(rng, category)
     _furnish(room, category)
     materials = room_materials(rng, category)
@@ -220,7 +211,7 @@ def build_room(seed: int, scene: int) -> Room:
     solids, part_materials = room.solids(names)
     faces = [names.index(name) for name in ("wall", "wall", "floor", "ceiling", "accent_wall", "wall")]
     main, fill, ambient = _lights(rng, room.size)
-    scene_ = Scene(
+    furnished = Scene(
         room_size=room.size,
         solids=solids,
         materials=list(materials.values()),
@@ -230,4 +221,4 @@ def build_room(seed: int, scene: int) -> Room:
         ambient=ambient,
         shadow=shadow_map(room.size, solids, main.position),
     )
-    return Room(scene_, _choose_path(room, solids))
+    return Room(furnished, _choose_path(room, solids))

@@ -88,8 +88,8 @@ def _hits(scene: Scene, view: View, depth: F32, surface: NDArray[np.int16]) -> _
     yaw = np.concatenate([np.zeros(ROOM_FACES), solids.yaw])
     cos, sin = np.cos(yaw).astype(np.float32)[flat], np.sin(yaw).astype(np.float32)[flat]
     dx, dy, dz = (point[k] - centre[flat, k] for k in range(3))
-    local = np.stack([dx * cos - dz * sin, dy, dx * sin + dz * cos])
-    unit: F32 = local * (1 / half).T[:, flat]
+    local: F32 = np.stack([dx * cos - dz * sin, dy, dx * sin + dz * cos])
+    unit: F32 = local / half.T[:, flat]
 
     axis = np.abs(unit).argmax(0)
     side = np.where(flat < ROOM_FACES, np.float32(-1), np.float32(1))
@@ -152,9 +152,7 @@ def _lit_fraction(scene: Scene, point: F32, upwards: F32) -> F32:
     cell = row * _SHADOW_CELLS + column
     flat = scene.shadow.ravel()
     near = (flat[cell] > limit) * (1 - across) + (flat[cell + 1] > limit) * across
-    far = (flat[cell + _SHADOW_CELLS] > limit) * (1 - across) + (
-        flat[cell + _SHADOW_CELLS + 1] > limit
-    ) * across
+    far = (flat[cell + _SHADOW_CELLS] > limit) * (1 - across) + (flat[cell + _SHADOW_CELLS + 1] > limit) * across
     lit = np.ones(point.shape[1], np.float32)
     lit[i] = near * (1 - along) + far * along
     return lit

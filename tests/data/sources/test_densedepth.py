@@ -51,9 +51,7 @@ def members(end: str) -> dict[str, bytes]:
         f"data/nyu2_{split}.csv": "".join(f"{r.image},{r.depth}{end}" for r in records).encode()
         for split, records in (("train", TRAIN), ("test", TEST))
     }
-    image = {
-        split: cv2.imencode(kind, RGB[..., ::-1])[1] for split, kind in (("train", ".jpg"), ("test", ".png"))
-    }
+    image = {split: cv2.imencode(kind, RGB[..., ::-1])[1] for split, kind in (("train", ".jpg"), ("test", ".png"))}
     depth = {"train": cv2.imencode(".png", DEPTH_8)[1], "test": cv2.imencode(".png", DEPTH_16)[1]}
     files = {}
     for record in [*TRAIN, *TEST]:
@@ -136,8 +134,7 @@ TRAIN_ROW = "data/nyu2_train/a_0001_out/1.jpg,data/nyu2_train/a_0001_out/1.png"
         ),
         (
             f"{TRAIN_ROW}\ndata/nyu2_train/a_out/1.jpg\n",
-            "'{path}' line 2: 'data/nyu2_train/a_out/1.jpg' is no pair of DenseDepth's train set. "
-            "Copy the list again.",
+            "'{path}' line 2: 'data/nyu2_train/a_out/1.jpg' is no pair of DenseDepth's train set. Copy the list again.",
         ),
         (
             TRAIN_ROW.replace("1.png", "2.png"),
@@ -156,9 +153,7 @@ def test_refuses_a_malformed_list(tmp_path: Path, rows: str, message: str) -> No
     assert refusal(DenseDepthSource(tmp_path)) == message.format(path=path)
 
 
-@pytest.mark.parametrize(
-    "name", ["../secret.png", "data/nyu2_train/../../x.png", "/etc/passwd", "nyu2_train.csv"]
-)
+@pytest.mark.parametrize("name", ["../secret.png", "data/nyu2_train/../../x.png", "/etc/passwd", "nyu2_train.csv"])
 def test_read_stays_inside(tmp_path: Path, name: str) -> None:
     source = DenseDepthSource(write(tmp_path, "folder"))
     with pytest.raises(DataError, match=r"not a name of DenseDepth's frames\.$"):
@@ -169,7 +164,7 @@ def test_unknown_subset(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         DenseDepthSource(tmp_path, subset="tests").records()
     assert str(caught.value) == (
-        "data.subset: no subset 'tests'. Did you mean 'test'? Choose one of train, test, all."
+        "data.source.subset: no subset 'tests'. Did you mean 'test'? Choose one of train, test, all."
     )
 
 
@@ -189,7 +184,7 @@ def test_missing_frame(tmp_path: Path) -> None:
     image = tmp_path / TRAIN[0].image
     with pytest.raises(DataError) as caught:
         source.read(source.records()[0])
-    assert str(caught.value) == f"no file '{image}'. Copy it there, or take the pair off the list."
+    assert str(caught.value) == f"no file '{image}'. Copy it there, or take it off the list."
 
 
 def repack(root: Path, name: str, data: bytes, method: int = zipfile.ZIP_DEFLATED) -> None:
@@ -217,9 +212,7 @@ def test_member_is_not_unpacked_beyond_the_cap(tmp_path: Path, monkeypatch: pyte
     repack(root, TRAIN[0].image, bytes(1 << 20))
     monkeypatch.setattr(densedepth, "MAX_MEMBER_BYTES", (1 << 20) - 1)
     monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("unpacked"))
-    assert read_refusal(root) == (
-        f"'{TRAIN[0].image}' in '{root}': larger than 0 MiB. It cannot be one image or list."
-    )
+    assert read_refusal(root) == (f"'{TRAIN[0].image}' in '{root}': larger than 0 MiB. It cannot be one image or list.")
 
 
 def test_member_that_understates_its_size(tmp_path: Path) -> None:
@@ -228,8 +221,7 @@ def test_member_that_understates_its_size(tmp_path: Path) -> None:
     data = root.read_bytes().replace((1 << 20).to_bytes(4, "little"), (1000).to_bytes(4, "little"))
     root.write_bytes(data)
     assert read_refusal(root) == (
-        f"'{TRAIN[0].image}' in '{root}': cannot be unpacked, the zip file is damaged. "
-        "Copy the zip file again."
+        f"'{TRAIN[0].image}' in '{root}': cannot be unpacked, the zip file is damaged. Copy the zip file again."
     )
 
 
@@ -238,8 +230,7 @@ def test_methods_whose_output_cannot_be_bounded(tmp_path: Path, method: int) -> 
     root = tmp_path / "nyu_data.zip"
     repack(root, "", b"", method)
     assert read_refusal(root) == (
-        f"'{TRAIN[0].image}' in '{root}': cannot be unpacked, the zip file is damaged. "
-        "Copy the zip file again."
+        f"'{TRAIN[0].image}' in '{root}': cannot be unpacked, the zip file is damaged. Copy the zip file again."
     )
 
 
@@ -247,8 +238,7 @@ def test_truncated_frame_in_the_zip(tmp_path: Path) -> None:
     root = tmp_path / "nyu_data.zip"
     repack(root, TRAIN[0].image, members("\n")[TRAIN[0].image][:-9])
     assert read_refusal(root) == (
-        f"'{TRAIN[0].image}' in '{root}': the JPEG is truncated (JPEG data without its end). "
-        "Copy the file again."
+        f"'{TRAIN[0].image}' in '{root}': the JPEG is truncated (JPEG data without its end). Copy the file again."
     )
 
 

@@ -11,11 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hudepth.data.sources.files import PerProcess, csv_rows, inside, make_pair, read_depth, read_image
-from hudepth.data.sources.headers import image_size
 from hudepth.errors import DataError
 
 RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
@@ -32,12 +29,7 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 
 def png_claiming(width: int, height: int) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(b""))
-        + chunk(b"IEND", b"")
-    )
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
 def message(error: pytest.ExceptionInfo[DataError]) -> str:
@@ -112,66 +104,14 @@ def test_colour_is_no_depth(channels: int) -> None:
     picture = np.dstack([RGB, RGB[..., 0]])[..., :channels]
     with pytest.raises(DataError) as caught:
         read_depth(encoded(".png", picture), where="'d.png'")
-    assert message(caught) == (
-        f"'d.png': {channels} channels that differ are a picture, not depth. Store one channel."
-    )
+    assert message(caught) == (f"'d.png': {channels} channels that differ are a picture, not depth. Store one channel.")
 
 
 def test_missing_file(tmp_path: Path) -> None:
     for name, read in (("a.jpg", read_image), ("a.png", read_depth), ("a.npy", read_depth)):
         with pytest.raises(DataError) as caught:
             read(tmp_path / name)
-        assert (
-            message(caught) == f"no file '{tmp_path / name}'. Copy it there, or take the pair off the list."
-        )
-
-
-@pytest.mark.parametrize("progressive", [0, 1])
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.99])
-def test_truncated_jpeg(share: float, progressive: int) -> None:
-    data = encoded(".jpg", RGB.repeat(8, 0).repeat(8, 1), cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
-    with pytest.raises(DataError) as caught:
-        read_image(data[: int(len(data) * share)], where="'a.jpg'")
-    assert (
-        message(caught) == "'a.jpg': the JPEG is truncated (JPEG data without its end). Copy the file again."
-    )
-
-
-def test_end_marker_inside_a_thumbnail_does_not_hide_truncation() -> None:
-    plain = encoded(".jpg", RGB)
-    thumbnail = b"Exif\0\0" + plain
-    data = plain[:2] + b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail + plain[2:]
-    np.testing.assert_array_equal(read_image(data), read_image(plain))
-    with pytest.raises(DataError, match="the JPEG is truncated"):
-        read_image(data[:-40])
-
-
-@pytest.mark.parametrize("tail", [b"\0" * 100, b"garbage \xff\xd8", b"\xff"])
-def test_jpeg_with_a_tail_is_complete(tail: bytes) -> None:
-    plain = encoded(".jpg", RGB)
-    np.testing.assert_array_equal(read_image(plain + tail), read_image(plain))
-
-
-@given(share=st.floats(0.001, 0.999))
-def test_truncated_png(share: float) -> None:
-    data = encoded(".png", DEPTH)
-    with pytest.raises(DataError) as caught:
-        read_depth(data[: max(8, int(len(data) * share))], where="'a.png'")
-    assert message(caught) == "'a.png': the PNG is truncated (PNG data without its end). Copy the file again."
-
-
-def test_damaged_png() -> None:
-    data = bytearray(encoded(".png", DEPTH))
-    data[len(data) // 2] ^= 0xFF
-    with pytest.raises(DataError) as caught:
-        read_depth(bytes(data), where="'a.png'")
-    assert message(caught) == "'a.png': the PNG is damaged (checksum of chunk b'IDAT'). Copy the file again."
-
-
-def test_png_without_header() -> None:
-    with pytest.raises(DataError) as caught:
-        read_depth(b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b""), where="'a.png'")
-    assert message(caught) == "'a.png': the PNG is damaged (it has no header). Copy the file again."
+        assert message(caught) == f"no file '{tmp_path / name}'. Copy it there, or take it off the list."
 
 
 def test_png_whose_pixels_are_missing() -> None:
@@ -180,37 +120,10 @@ def test_png_whose_pixels_are_missing() -> None:
     assert message(caught) == "'a.png': cannot be decoded, the file is damaged. Copy the file again."
 
 
-@pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
-def test_truncated_tiff(share: float) -> None:
-    data = encoded(".tif", DEPTH)
-    with pytest.raises(DataError, match=r"^'a.tif': "):
-        read_depth(data[: max(5, int(len(data) * share))], where="'a.tif'")
-
-
-@pytest.mark.parametrize(
-    ("data", "found"),
-    [
-        (b"", "an empty file"),
-        (b"GIF89a  ", "a file that begins with b'GIF89a  '"),
-        (b"\x93NUMPY\x01\x00", "a file that begins with b'\\x93NUMPY\\x01\\x00'"),
-    ],
-)
-def test_other_kinds_of_file(data: bytes, found: str) -> None:
-    with pytest.raises(DataError) as caught:
-        read_image(data, where="'a'")
-    assert message(caught) == f"'a': neither PNG, JPEG nor TIFF but {found}. Replace it."
-
-
 def test_tiff_is_no_image() -> None:
     with pytest.raises(DataError) as caught:
         read_image(encoded(".tif", DEPTH), where="'a.tif'")
     assert message(caught) == "'a.tif': a TIFF cannot be the image of a pair. Store images as JPEG or PNG."
-
-
-@given(data=st.binary(max_size=64), start=st.sampled_from([b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0"]))
-def test_noise_is_refused_with_an_error_of_ours(data: bytes, start: bytes) -> None:
-    with pytest.raises(DataError):
-        read_depth(start + data)
 
 
 @pytest.mark.parametrize(("width", "height"), [(50_000, 50_000), (0, 12), (2**31, 1)])
@@ -218,9 +131,7 @@ def test_size_is_checked_before_decoding(monkeypatch: pytest.MonkeyPatch, width:
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     with pytest.raises(DataError) as caught:
         read_image(png_claiming(width, height), where="'a.png'")
-    assert message(caught) == (
-        f"'a.png': {width} x {height} pixels, allowed are 1 to 100 million. Resize the file."
-    )
+    assert message(caught) == (f"'a.png': {width} x {height} pixels, allowed are 1 to 100 million. Resize the file.")
 
 
 def test_jpeg_and_tiff_sizes_are_checked_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,12 +146,6 @@ def test_jpeg_and_tiff_sizes_are_checked_before_decoding(monkeypatch: pytest.Mon
         assert message(caught) == "'a': 50000 x 60000 pixels, allowed are 1 to 100 million. Resize the file."
 
 
-@pytest.mark.parametrize("extension", [".png", ".jpg", ".tif"])
-@pytest.mark.parametrize("shape", [(12, 20), (1, 1), (300, 7)])
-def test_image_size_is_the_decoders(extension: str, shape: tuple[int, int]) -> None:
-    assert image_size(encoded(extension, np.zeros(shape, np.uint8)), where="") == shape
-
-
 def npy(path: Path, header: str, body: bytes = b"") -> Path:
     text = header.encode()
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + body)
@@ -252,9 +157,7 @@ def test_npy_never_unpickles(tmp_path: Path) -> None:
     np.save(path, np.array([[{"a": 1}]], dtype=object))
     with pytest.raises(DataError) as caught:
         read_depth(path)
-    assert message(caught) == (
-        f"'{path}': not a complete .npy array of plain numbers. Save it with numpy.save."
-    )
+    assert message(caught) == (f"'{path}': not a complete .npy array of plain numbers. Save it with numpy.save.")
 
 
 def test_npy_size_is_checked_before_reading(tmp_path: Path) -> None:
@@ -280,9 +183,7 @@ def test_damaged_npy(tmp_path: Path, header: str) -> None:
     path = npy(tmp_path / "d.npy", header, b"\0" * 8)
     with pytest.raises(DataError) as caught:
         read_depth(path)
-    assert message(caught) == (
-        f"'{path}': not a complete .npy array of plain numbers. Save it with numpy.save."
-    )
+    assert message(caught) == (f"'{path}': not a complete .npy array of plain numbers. Save it with numpy.save.")
 
 
 def test_npz_under_another_name(tmp_path: Path) -> None:
@@ -335,8 +236,7 @@ def test_paths_outside(tmp_path: Path, name: str) -> None:
     with pytest.raises(DataError) as caught:
         inside(tmp_path, name, where="'index.csv' line 2")
     assert message(caught) == (
-        f"'index.csv' line 2: path {name!r} is not inside the data folder. "
-        f"Use paths relative to '{tmp_path}'."
+        f"'index.csv' line 2: path {name!r} is not inside the data folder. Use paths relative to '{tmp_path}'."
     )
 
 

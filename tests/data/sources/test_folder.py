@@ -90,13 +90,10 @@ def test_unpaired(tmp_path: Path) -> None:
     )
     write(tmp_path, "depths/b.png", "depths/c.png", "depths/x/d.npy")
     assert refusal(source) == (
-        f"data.root: 1 of 4 depth maps in '{tmp_path}' have no image, "
-        f"the first is 'depths/x/d.npy'. {expects}"
+        f"data.root: 1 of 4 depth maps in '{tmp_path}' have no image, the first is 'depths/x/d.npy'. {expects}"
     )
     write(tmp_path, "depths/a.npy")
-    assert refusal(source) == (
-        "'depths/a.npy' and 'depths/a.png' are both the depth of 'a'. Keep one of them."
-    )
+    assert refusal(source) == ("'depths/a.npy' and 'depths/a.png' are both the depth of 'a'. Keep one of them.")
 
 
 def test_roots_without_pairs(tmp_path: Path) -> None:
@@ -105,31 +102,30 @@ def test_roots_without_pairs(tmp_path: Path) -> None:
     )
     source = FolderSource(tmp_path, encoding="auto")
     assert refusal(source) == (
-        f"data.images: no folder 'images' in '{tmp_path}'. Pass data.images=<folder within data.root>."
+        f"data.source.images: no folder 'images' in '{tmp_path}'. Pass data.source.images=<folder within data.root>."
     )
     (tmp_path / "images").mkdir()
     assert refusal(source) == (
-        f"data.depths: no folder 'depths' in '{tmp_path}'. Pass data.depths=<folder within data.root>."
+        f"data.source.depths: no folder 'depths' in '{tmp_path}'. Pass data.source.depths=<folder within data.root>."
     )
     (tmp_path / "depths").mkdir()
     assert refusal(source) == (
-        f"data.root: no pairs in '{tmp_path}'. "
-        "Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
+        f"data.root: no pairs in '{tmp_path}'. Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
     )
 
 
 def test_one_folder_needs_suffixes(tmp_path: Path) -> None:
     write(tmp_path, "a.jpg", "a.png")
     assert refusal(FolderSource(tmp_path, images=".", depths="./", encoding="auto")) == (
-        "data.images and data.depths are both '.', images and depth maps look alike. "
-        "Pass data.image_suffix=_rgb data.depth_suffix=_depth, as your files are named."
+        "data.source.images and data.source.depths are both '.', images and depth maps look alike. "
+        "Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as your files are named."
     )
 
 
 def test_folders_stay_inside(tmp_path: Path) -> None:
     (tmp_path / "depths").mkdir()
     assert refusal(FolderSource(tmp_path, images="../x", encoding="auto")) == (
-        f"data.images: path '../x' is not inside the data folder. Use paths relative to '{tmp_path}'."
+        f"data.source.images: path '../x' is not inside the data folder. Use paths relative to '{tmp_path}'."
     )
 
 

@@ -122,14 +122,11 @@ def test_missing_file_and_unequal_sizes(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         source.read(unequal)
     assert str(caught.value) == (
-        f"'{tmp_path / 'a.jpg'}' is 8 x 6 pixels but '{tmp_path / 'a.png'}' is 8 x 4. "
-        "Both must have one size."
+        f"'{tmp_path / 'a.jpg'}' is 8 x 6 pixels but '{tmp_path / 'a.png'}' is 8 x 4. Both must have one size."
     )
     with pytest.raises(DataError) as caught:
         source.read(missing)
-    assert str(caught.value) == (
-        f"no file '{tmp_path / 'b.jpg'}'. Copy it there, or take the pair off the list."
-    )
+    assert str(caught.value) == (f"no file '{tmp_path / 'b.jpg'}'. Copy it there, or take it off the list.")
 
 
 def test_read_stays_inside(tmp_path: Path) -> None:
@@ -236,9 +233,7 @@ def test_labelled_nyu_in_metres(nyu_root: Path) -> None:
         assert pair.image.shape == (480, 640, 3)
         stored = cv2.imread(str(nyu_root / row["depth"]), cv2.IMREAD_UNCHANGED)
         assert stored is not None
-        depth = to_metres(
-            pair.depth, source.encoding, scale_m=record.depth_scale_m, offset=record.depth_offset
-        )
+        depth = to_metres(pair.depth, source.encoding, scale_m=record.depth_scale_m, offset=record.depth_offset)
         expected = (stored.astype(np.float64) + float(row["depth_offset"])) * float(row["depth_scale_m"])
         np.testing.assert_array_equal(depth, expected.astype(np.float32))
         depths.append(depth)

@@ -17,7 +17,6 @@ from hudepth.data.sources import mat5
 from hudepth.data.sources.mat5 import read_mat5
 from hudepth.errors import DataError
 
-NYU_ROOT = Path(os.environ.get("HUDEPTH_NYU_ROOT", Path(__file__).parents[3] / "../shared/data/nyu_labeled"))
 DTYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 

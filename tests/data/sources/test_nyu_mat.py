@@ -57,10 +57,21 @@ def refusal(source: NyuMatSource) -> str:
 
 def test_records(tmp_path: Path) -> None:
     path = write_mat(tmp_path)
+    named = [
+        ("kitchen_0004", 0, "kitchen"),
+        ("study_room_0005b", 0, "study_room"),
+        ("kitchen_0004", 1, "kitchen"),
+    ]
     expected = [
-        Record(id="00000", scene="kitchen_0004", frame=0, category="kitchen"),
-        Record(id="00001", scene="study_room_0005b", frame=0, category="study_room"),
-        Record(id="00002", scene="kitchen_0004", frame=1, category="kitchen"),
+        Record(
+            id=f"0000{index}",
+            scene=scene,
+            frame=frame,
+            category=category,
+            image=f"images/0000{index}",
+            depth=f"depths/0000{index}",
+        )
+        for index, (scene, frame, category) in enumerate(named)
     ]
     assert NyuMatSource(tmp_path).records() == expected
     assert NyuMatSource(path).records() == expected
@@ -83,6 +94,7 @@ def test_raw_depths(tmp_path: Path) -> None:
     write_mat(tmp_path)
     source = NyuMatSource(tmp_path, depth="rawDepths")
     np.testing.assert_array_equal(source.read(source.records()[1]).depth, RAW_DEPTHS[1])
+    assert source.fingerprint() != NyuMatSource(tmp_path).fingerprint()
 
 
 def test_unknown_depth(tmp_path: Path) -> None:
@@ -90,7 +102,7 @@ def test_unknown_depth(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         NyuMatSource(tmp_path, depth="rawdepths").records()
     assert str(caught.value) == (
-        "data.depth: no depth 'rawdepths'. Did you mean 'rawDepths'? Choose one of depths, rawDepths."
+        "data.source.depth: no depth 'rawdepths'. Did you mean 'rawDepths'? Choose one of depths, rawDepths."
     )
 
 
@@ -127,21 +139,17 @@ def test_split_beside_the_file_or_elsewhere(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_refuses_a_split_that_does_not_fit(
-    tmp_path: Path, numbers: dict[str, list[int]], message: str
-) -> None:
+def test_refuses_a_split_that_does_not_fit(tmp_path: Path, numbers: dict[str, list[int]], message: str) -> None:
     write_mat(tmp_path)
     splits = write_splits(tmp_path / "splits.mat", **numbers)
-    assert refusal(NyuMatSource(tmp_path)) == (
-        f"'{splits}': {message} Pass data.splits=<path of NYU's splits.mat>."
-    )
+    assert refusal(NyuMatSource(tmp_path)) == (f"'{splits}': {message} Use NYU's own splits.mat.")
 
 
 def test_missing_split(tmp_path: Path) -> None:
     write_mat(tmp_path)
     gone = tmp_path / "gone.mat"
     assert refusal(NyuMatSource(tmp_path, splits=gone)) == (
-        f"no file '{gone}'. Copy it there, or take the pair off the list."
+        f"data.source.splits: no file '{gone}'. Use NYU's own splits.mat."
     )
 
 
@@ -215,9 +223,7 @@ LAYOUTS: list[tuple[str, Callable[[h5py.File], object], str]] = [
 
 
 @pytest.mark.parametrize(("name", "change", "message"), LAYOUTS)
-def test_layout_is_checked(
-    tmp_path: Path, name: str, change: Callable[[h5py.File], object], message: str
-) -> None:
+def test_layout_is_checked(tmp_path: Path, name: str, change: Callable[[h5py.File], object], message: str) -> None:
     path = altered(tmp_path, name, change)
     assert refusal(NyuMatSource(path)) == f"'{path}'{message}"
 
@@ -276,6 +282,4 @@ def test_unequal_sizes(tmp_path: Path) -> None:
     record = source.records()[0]
     with pytest.raises(DataError) as caught:
         source.read(record)
-    assert str(caught.value) == (
-        f"'{path}' image 0 is 8 x 6 pixels but its depths is 8 x 4. Both must have one size."
-    )
+    assert str(caught.value) == (f"'{path}' image 0 is 8 x 6 pixels but its depths is 8 x 4. Both must have one size.")

@@ -89,8 +89,7 @@ def test_refusals(tmp_path: Path) -> None:
     write(tmp_path / "b", "00005")
     (tmp_path / "b/rgb_00005.jpg").unlink()
     assert refusal(NyuRawSource(tmp_path)) == (
-        f"data.root: 1 of 2 depth maps in '{tmp_path}' have no image, the first is 'b/sync_depth_00005.png'. "
-        f"{EXPECTED}"
+        f"data.root: 1 of 2 depth maps in '{tmp_path}' have no image, the first is 'b/sync_depth_00005.png'. {EXPECTED}"
     )
     (tmp_path / "a/rgb_00000.png").touch()
     assert refusal(NyuRawSource(tmp_path)) == (
@@ -107,9 +106,7 @@ def test_truncated_frame(tmp_path: Path) -> None:
     source = NyuRawSource(tmp_path)
     with pytest.raises(DataError) as caught:
         source.read(source.records()[0])
-    assert str(caught.value) == (
-        f"'{path}': the JPEG is truncated (JPEG data without its end). Copy the file again."
-    )
+    assert str(caught.value) == (f"'{path}': the JPEG is truncated (JPEG data without its end). Copy the file again.")
 
 
 def test_real_frames(nyu_root: Path) -> None:
