@@ -15,12 +15,11 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import nn
-from torch.utils.data import DataLoader
 
 from hudepth import run_dir
 from hudepth.console import console, duration, log
 from hudepth.data.datamodule import preprocess
-from hudepth.data.dataset import StoreDataset, as_is
+from hudepth.data.dataset import StoreDataset
 from hudepth.data.store import DepthStore
 from hudepth.files import write_text
 from hudepth.viz.panels import Panel, draw_panels, save_panels
@@ -153,7 +152,9 @@ def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *,
     was_training = module.training
     module.eval()
     device = next(module.parameters()).device
-    for raw in DataLoader(StoreDataset(store, indices), batch_size=1, collate_fn=as_is):
+    dataset = StoreDataset(store, indices)
+    for position in range(len(dataset)):  # no DataLoader: it would draw from the generator that training draws from
+        raw = dataset[position]
         batch = preprocess(raw, max_depth_m=max_depth_m)
         pred_m = module(batch["image"].to(device)).float().cpu()[0, 0] * max_depth_m
         truth_m = np.minimum(raw["depth_mm"][0].numpy() / np.float32(1000), np.float32(max_depth_m))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,35 +65,41 @@ class Checkpoint:
     def build_net(self, *, trust: list[str]) -> nn.Module:
         """Return the network in evaluation mode.
 
-        It is laid out without memory and then given the checkpoint's tensors, so that a configuration which asks for
-        more than the file holds is an error and not an exhausted machine.
+        It is first laid out without memory and compared with the checkpoint's tensors, so that a configuration which
+        asks for more than the file holds is an error and not an exhausted machine. Code that the user trusts can do
+        as it likes anyway and need not bear being built twice.
 
         Args:
             trust: further modules whose classes the configuration may name.
 
         Raises:
             CheckpointError: if the tensors are not those of the configured network.
-            ConfigError: if the configuration names something that is not trusted.
+            ConfigError: if the configuration names something that is not trusted, or no network.
         """
         model = dict(self.config["model"])
         if "weights" in model:
             model["weights"] = None  # the trunk's start does not matter any more
-        with torch.device("meta"):
-            net: nn.Module = instantiate(model, trust=trust)
-        try:
-            net.load_state_dict(self.state, assign=True)
-        except RuntimeError as error:
-            own, given = net.state_dict(), self.state
-            unlike = [
-                name
-                for name in {**own, **given}
-                if name not in own or name not in given or own[name].shape != given[name].shape
-            ]
-            raise CheckpointError(
-                f"'{self.path}' is from another model: {len(unlike)} tensors do not fit {model.get('_target_')}, "
-                f"the first is '{unlike[0] if unlike else '?'}'. Pass a checkpoint whose configuration matches its weights."
-            ) from error
+        only = object if trust else nn.Module
+        if not trust:
+            if sum(tensor.nbytes for tensor in self.state.values()) > self.path.stat().st_size:
+                raise CheckpointError(f"'{self.path}' is refused: its tensors claim more memory than the file holds.")
+            with torch.device("meta"):
+                self._check_fits(instantiate(model, only=only))
+        net: nn.Module = instantiate(model, trust=trust, only=only)
+        self._check_fits(net)
+        net.load_state_dict(self.state)
         return net.eval()
+
+    def _check_fits(self, net: nn.Module) -> None:
+        own, given = net.state_dict(), self.state
+        names = {**own, **given}
+        unlike = [n for n in names if n not in own or n not in given or own[n].shape != given[n].shape]
+        if unlike:
+            raise CheckpointError(
+                f"'{self.path}' is from another model: {len(unlike)} tensors do not fit "
+                f"{self.config['model'].get('_target_')}, the first is '{unlike[0]}'. "
+                "Pass a checkpoint whose configuration matches its weights."
+            )
 
 
 def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
@@ -111,6 +118,8 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
         for name in (run_dir.BEST, run_dir.LAST):
             if (folder / name).is_file():
                 return folder / name
+        if not run_dir.is_run(path):
+            raise CheckpointError(f"checkpoint: the folder '{path}' is no run directory. Pass a file, a run, or last.")
         raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint; its first epoch was never finished.")
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file or run directory '{path}'. Pass a file, a run directory, or last.")
@@ -121,8 +130,9 @@ def read_plain(path: Path) -> dict[str, Any]:
     """Read a file of plain types; anything else in it is refused unread.
 
     Raises:
-        CheckpointError: if the file is damaged, or holds code.
+        CheckpointError: if the file is damaged, holds code, or unpacks to more than its own size.
     """
+    _check_archive(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
@@ -131,12 +141,31 @@ def read_plain(path: Path) -> dict[str, Any]:
             "Use a checkpoint written by hudepth-train."
         ) from error
     except Exception as error:
-        raise CheckpointError(
-            f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)})."
-        ) from error
+        raise _damaged(path, error) from error
     if not isinstance(content, dict):
         raise CheckpointError(f"'{path}' holds no checkpoint, but a {type(content).__name__}.")
     return content
+
+
+def _check_archive(path: Path) -> None:
+    """Refuse a damaged file before any of it is taken for code, and one that a reader would blow up in memory."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+            fits = unpacked <= path.stat().st_size  # torch.save does not compress
+            broken = archive.testzip() if fits else None
+    except Exception as error:  # zipfile knows a dozen ways in which a file can be broken
+        raise _damaged(path, error) from error
+    if not fits:
+        raise CheckpointError(
+            f"'{path}' is refused: it unpacks to more than its own size. Use a checkpoint written by hudepth-train."
+        )
+    if broken:
+        raise _damaged(path, zipfile.BadZipFile(f"'{broken}' has a wrong checksum"))
+
+
+def _damaged(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)}).")
 
 
 def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
@@ -156,16 +185,20 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
     if own.get("version") != VERSION:
         raise CheckpointError(f"'{path}' has checkpoint version {own.get('version')}; this hudepth reads {VERSION}.")
-    state = {
-        name.removeprefix(NET_PREFIX): value
-        for name, value in content["state_dict"].items()
-        if name.startswith(NET_PREFIX)
-    }
+    config, split, epoch = own.get("config"), own.get("split"), content.get("epoch")
+    if not (
+        isinstance(config, dict)
+        and isinstance(config.get("model"), dict)
+        and isinstance(split, dict)
+        and isinstance(epoch, int)
+        and _is_state(content["state_dict"])
+    ):
+        raise CheckpointError(f"'{path}' is incomplete: its configuration, split, epoch or tensors are not there.")
+    state = {n.removeprefix(NET_PREFIX): v for n, v in content["state_dict"].items() if n.startswith(NET_PREFIX)}
     return Checkpoint(
-        path=path,
-        run=run_dir.run_of(path.resolve()),
-        config=own["config"],
-        split=own["split"],
-        epoch=int(content.get("epoch", -1)) + 1,
-        state=state,
+        path=path, run=run_dir.run_of(path.resolve()), config=config, split=split, epoch=epoch + 1, state=state
     )
+
+
+def _is_state(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(n, str) and isinstance(v, Tensor) for n, v in value.items())

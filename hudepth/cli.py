@@ -90,31 +90,32 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
 def _run_hydra(task: str) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing; one_line() words the error
     import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
-    failures: list[str] = []
+    errors: dict[int, Exception] = {}
 
     def job(cfg: Any) -> Any:
-        from hydra.core.hydra_config import HydraConfig
-        from hydra.types import RunMode
-
         from hudepth.console import setup_logging
 
         setup_logging()
-        run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.tasks.{task}"), task)
+        sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
+        number = HydraConfig.get().job.num if sweeping else -1
         try:
+            run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.tasks.{task}"), task)
             return run(cfg)
-        except Exception as error:
-            if HydraConfig.get().mode != RunMode.MULTIRUN:
-                raise
-            # The other jobs of a sweep go on; what failed is said at once, and again at the end.
-            failures.append(f"job {HydraConfig.get().job.num}: {one_line(error, task)}")
-            print(f"hudepth-{task}: {failures[-1]}", file=sys.stderr)
+        except Exception as error:  # kept from Hydra, which would print it in its own way and hide all but the first
+            errors[number] = error
+            if sweeping:
+                print(f"hudepth-{task}: job {number}: {one_line(error, task)}", file=sys.stderr)
             return None
 
     hydra.main(config_path="pkg://hudepth.conf", config_name=task, version_base="1.3")(job)()
-    if failures:
-        print(f"hudepth-{task}: {len(failures)} jobs failed:", *failures, sep="\n  ", file=sys.stderr)
-    return 1 if failures else 0
+    if -1 in errors:
+        raise errors[-1]
+    if errors:
+        raise ConfigError(f"{len(errors)} jobs failed: {', '.join(map(str, errors))}. What each said stands above.")
+    return 0
 
 
 def one_line(error: BaseException, task: str) -> str:
@@ -155,17 +156,9 @@ def _config_line(error: BaseException, task: str) -> str | None:
     if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
         key = found[1] or getattr(error, "full_key", None) or found[2]
         return f"no key '{key}'.{did_you_mean(key, known_keys(task))} See hudepth-{task} --cfg job for all keys."
-    if "Could not override" in text or "missing from config" in text.lower():
-        return " ".join(text.split())
-    if (
-        "LexerNoViableAlt" in text
-        or "mismatched input" in text
-        or "extraneous input" in text
-        or "no viable alternative" in text
-    ):
-        return (
-            f"cannot read the command line: {text.splitlines()[0]} Quote values with special characters: 'key=\"a b\"'."
-        )
+    if "Override" in type(error).__name__ or module == "antlr4" or "NoViableAlt" in text:
+        typed = getattr(error, "override", None) or text.split(": ", 1)[-1]
+        return f"cannot read '{typed}': write key=value, and quote values with special characters: 'key=\"a, b\"'."
     return " ".join(text.split())
 
 
@@ -182,16 +175,21 @@ def options_of(group: str) -> list[str]:
 
 
 def known_keys(task: str) -> list[str]:
-    """Return all dotted keys and groups that the task's configuration has by default."""
+    """Return all dotted keys and groups of the task's configuration, with the groups chosen on the command line."""
     from hydra import compose, initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
     GlobalHydra.instance().clear()
     with initialize_config_module("hudepth.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose(task), resolve=False)
+        config = OmegaConf.to_container(compose(task, overrides=_chosen_groups()), resolve=False)
     keys = list(_dotted(config))
     return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
+
+
+def _chosen_groups() -> list[str]:
+    pairs = [argument.partition("=") for argument in sys.argv[1:]]
+    return [f"{group}={name}" for group, _, name in pairs if name in options_of(group.lstrip("+"))]
 
 
 def _dotted(config: Any, prefix: str = "") -> Iterator[str]:

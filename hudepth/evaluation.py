@@ -10,6 +10,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from hudepth.data.store import DepthStore
+from hudepth.errors import ConfigError
 from hudepth.metrics.protocol import Protocol
 from hudepth.types import Batch
 
@@ -65,6 +66,9 @@ class Evaluation(LightningModule):
         predictors: by name; normalised image to unit depth.
         protocols: how to score.
         max_depth_m: what unit depth 1 stands for.
+
+    Raises:
+        ConfigError: if two protocols have one name, which would mix their rows.
     """
 
     def __init__(
@@ -73,6 +77,9 @@ class Evaluation(LightningModule):
         super().__init__()
         self.predictors = nn.ModuleDict(dict(predictors))
         self.protocols = list(protocols)
+        names = [protocol.name for protocol in protocols]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"protocol: two have one name among {', '.join(names)}. Give each its own name.")
         self.max_depth_m = max_depth_m
         self._rows: dict[tuple[str, str], list[Tensor]] = {}
         self._indices: list[Tensor] = []

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import platform
 import subprocess
@@ -47,9 +48,9 @@ def create(parent: str | Path, name: str) -> Path:
         path = base / (stamp if attempt == 1 else f"{stamp}_{attempt}")
         try:
             path.mkdir(parents=True)
-        except FileExistsError:
-            continue
         except OSError as error:
+            if isinstance(error, FileExistsError) and path.exists():  # a dangling link above it also "exists"
+                continue
             raise ConfigError(
                 f"paths.runs: cannot make '{path}' ({error.strerror}). Pass paths.runs=<a folder you can write to>."
             ) from error
@@ -83,15 +84,20 @@ def read_config(path: Path) -> dict[str, Any]:
     """
     try:
         config = yaml.safe_load((path / "config.yaml").read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise CheckpointError(f"'{path}' is no run directory: its config.yaml cannot be read ({error}).") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        why = " ".join(str(error).split())
+        raise CheckpointError(f"'{path}' is no run directory: its config.yaml cannot be read ({why}).") from error
     if not isinstance(config, dict):
         raise CheckpointError(f"'{path}' is no run directory: its config.yaml holds no mapping.")
     return config
 
 
 def write_status(path: Path, state: str, **more: Any) -> None:
-    """Write status.json: ``running``, ``finished``, ``failed`` or ``interrupted``, with the time and whatever else."""
+    """Write status.json: ``running``, ``finished``, ``failed`` or ``interrupted``, with the time and whatever else.
+
+    A number that is not finite becomes null, which JSON has a word for.
+    """
+    more = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in more.items()}
     now = datetime.now(UTC).isoformat(timespec="seconds")
     write_json(path / "status.json", {"state": state, "time": now, "pid": os.getpid(), **more})
 
@@ -119,7 +125,7 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {name: metadata.version(name) for name in PACKAGES},
+        "packages": {name: _version(name) for name in PACKAGES},
         "git": _git(),
         "accelerator": accelerator,
         "device": torch.cuda.get_device_name()
@@ -129,6 +135,13 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
         "seed": seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None  # another build of it, for example opencv-python, or a source tree that was never installed
 
 
 def _git() -> dict[str, Any] | None:

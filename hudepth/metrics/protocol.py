@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from hudepth.errors import ConfigError, did_you_mean
+from hudepth.metrics.collection import AVERAGINGS
 from hudepth.metrics.depth import SUM_NAMES, depth_metrics_from_sums, depth_sums
 from hudepth.metrics.ssim import ssim
 from hudepth.types import Batch
 
 RESOLUTIONS = ("network", "native")
-AVERAGINGS = ("image", "pooled")
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Protocol:
 
     name: str
     resolution: str = "network"
-    """``network``: prediction and truth at training size; ``native``: the prediction is resized bilinearly to the truth."""
+    """``network``: prediction and truth at training size; ``native``: prediction resized bilinearly to the truth's."""
     crop: Sequence[int] | None = None
     """Rows and columns that count, [top, bottom, left, right] in an image of ``crop_size``; None for all."""
     crop_size: Sequence[int] = (480, 640)
@@ -65,12 +65,21 @@ class Protocol:
                     f"protocol.{self.name}.{key}: no '{value}'.{did_you_mean(value, choices)} "
                     f"Pass one of {', '.join(choices)}."
                 )
-        if self.crop is not None and (
-            len(self.crop) != 4 or self.crop[0] >= self.crop[1] or self.crop[2] >= self.crop[3]
-        ):
-            raise ConfigError(f"protocol.{self.name}.crop: {list(self.crop)} is not [top,bottom,left,right].")
+        if len(self.crop_size) != 2 or min(self.crop_size) < 1:
+            raise ConfigError(f"protocol.{self.name}.crop_size: {list(self.crop_size)} is not [height,width].")
+        if self.crop is not None and not _is_crop(self.crop, self.crop_size):
+            raise ConfigError(
+                f"protocol.{self.name}.crop: {list(self.crop)} is not [top,bottom,left,right] "
+                f"within {list(self.crop_size)}."
+            )
+        if self.min_depth_m < 0:
+            raise ConfigError(f"protocol.{self.name}.min_depth_m: {self.min_depth_m} is negative.")
         if self.max_depth_m is not None and self.max_depth_m <= self.min_depth_m:
             raise ConfigError(f"protocol.{self.name}.max_depth_m: {self.max_depth_m} is not above min_depth_m.")
+        if not 0 <= self.silog_lambda <= 1:
+            raise ConfigError(f"protocol.{self.name}.silog_lambda: {self.silog_lambda} is not in [0, 1].")
+        if self.ssim_data_range_m <= 0 or self.ssim_window < 1:
+            raise ConfigError(f"protocol.{self.name}: ssim_data_range_m and ssim_window must be positive.")
 
     @property
     def needs_native(self) -> bool:
@@ -126,13 +135,14 @@ class Protocol:
     def stamp(self) -> dict[str, Any]:
         """Return all that decides the numbers, for a metric file."""
         return {
+            **self.extra,
             "name": self.name,
             "resolution": self.resolution,
             "resize": "bilinear, align_corners=False" if self.needs_native else "none",
             "crop": list(self.crop) if self.crop else None,
             "crop_size": list(self.crop_size) if self.crop else None,
-            "valid": f"measured, {self.min_depth_m:g} m < truth"
-            + ("" if self.max_depth_m is None else f" < {self.max_depth_m:g} m"),
+            "valid": f"measured, {self.min_depth_m} m < truth"
+            + ("" if self.max_depth_m is None else f" < {self.max_depth_m} m"),
             "clamp_m": [self.min_depth_m, self.max_depth_m] if self.clamp else None,
             "averaging": self.averaging,
             "alignment": "none",
@@ -145,7 +155,6 @@ class Protocol:
                 "averaging": "image, windows of valid pixels only",
             },
             "units": UNITS,
-            **self.extra,
         }
 
     def per_image(self, sums: Float[Tensor, "n k"]) -> dict[str, Float[Tensor, " n"]]:
@@ -155,6 +164,9 @@ class Protocol:
     def summary(self, sums: Float[Tensor, "n k"]) -> dict[str, float]:
         """Return the metrics of the subset from the sums of its images, averaged as the protocol says.
 
+        Images without a pixel that counts are skipped. A prediction that is NaN where a pixel counts makes the metric
+        NaN: skipping it would flatter the model.
+
         Raises:
             ConfigError: if no pixel of any image counts.
         """
@@ -163,15 +175,18 @@ class Protocol:
             raise ConfigError(
                 f"protocol={self.name}: no pixel of {len(sums)} images counts; look at its crop and caps."
             )
-        if self.averaging == "image":
-            return {name: values.nanmean().item() for name, values in self.per_image(counted).items()}
-        pooled = {name: value.item() for name, value in self._finish(counted.sum(dim=0)).items()}
-        return {**pooled, "ssim": counted[:, -1].nanmean().item()}
+        metrics = self._finish(counted.T if self.averaging == "image" else counted.sum(dim=0))
+        ssim_mean = counted[:, -1].nanmean()  # NaN where an image has no whole window of valid pixels
+        return {**{name: values.mean().item() for name, values in metrics.items()}, "ssim": ssim_mean.item()}
 
     def _finish(self, columns: Float[Tensor, k * n]) -> dict[str, Float[Tensor, "*n"]]:
         sums = dict(zip(SUM_COLUMNS, columns, strict=True))
         del sums["ssim"]
         return depth_metrics_from_sums(sums, silog_lambda=self.silog_lambda, silog_factor=self.silog_factor)
+
+
+def _is_crop(crop: Sequence[int], size: Sequence[int]) -> bool:
+    return len(crop) == 4 and 0 <= crop[0] < crop[1] <= size[0] and 0 <= crop[2] < crop[3] <= size[1]
 
 
 UNITS = {"mae": "m", "rmse": "m", "sq_rel": "m", "mse": "m^2", "others": "1"}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 from urllib.error import URLError
 
 import torch
@@ -128,11 +128,12 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
             f"model.weights: '{path}' is not a file of plain tensors ({type(error).__name__}). "
             "Pass a ResNet-18 state_dict with torchvision's parameter names, or model.weights=none."
         ) from error
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+    plain = isinstance(state, dict) and all(isinstance(n, str) and isinstance(v, Tensor) for n, v in state.items())
+    if not plain:
         raise CheckpointError(
             f"model.weights: '{path}' holds no state_dict. Pass a ResNet-18 file with torchvision's parameter names."
         )
-    return state
+    return cast("dict[str, Tensor]", state)
 
 
 def _download_imagenet() -> dict[str, Tensor]:

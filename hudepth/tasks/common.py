@@ -24,7 +24,8 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
-        raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<value>.")
+        wanted = {"checkpoint": "file | run directory | last"}.get(missing[0], "value")
+        raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<{wanted}>.")
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     return {str(key): value for key, value in config.items()}

@@ -78,7 +78,7 @@ def _run_path(config: dict[str, Any]) -> Path:
         path = Path(hydra.runtime.output_dir)
         path.mkdir(parents=True, exist_ok=True)
         return path.resolve()
-    return run_dir.create(config["paths"]["runs"], config["name"])
+    return run_dir.create(config["paths"]["runs"], str(config["name"]))
 
 
 def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
@@ -244,7 +244,7 @@ def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> T
             enable_progress_bar=shows_progress(),
             num_sanity_val_steps=0,
             use_distributed_sampler=False,  # the data module shards by itself, exactly
-            log_every_n_steps=10,
+            log_every_n_steps=1,  # all is logged by epoch; a larger number only makes Lightning warn
         )
     except (TypeError, ValueError) as error:
         raise ConfigError(f"trainer: {error}") from error

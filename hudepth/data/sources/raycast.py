@@ -21,6 +21,8 @@ ROOM_FACES = 6
 """The first surfaces are the room's faces: 2 * axis for the side at 0, 2 * axis + 1 for the other."""
 
 _NEAR_M = 0.05
+_NEVER_ZERO = 1e-20
+"""Added to directions: a ray parallel to a face gets a huge distance to it instead of a division by zero."""
 _NYU_FX, _NYU_FY, _NYU_CX, _NYU_CY = 518.857901, 519.469611, 325.582449, 253.736166
 _NYU_WIDTH, _NYU_HEIGHT = 640, 480
 
@@ -127,8 +129,8 @@ def _trace_room(view: View, room_size: F64) -> tuple[F32, NDArray[np.int16]]:
 def _directions(component: F64, xs: F32, ys: F32) -> F32:
     """Return [h, w] rays' component along an axis that has ``component`` along right, down and forward."""
     right, down, forward = component.astype(np.float32)
-    across = xs * right + (forward + np.float32(1e-20))  # 1e-20: no ray is parallel to a face
-    direction: F32 = ys[:, None] * down + across
+    direction: F32 = ys[:, None] * down + (xs * right + forward)
+    direction += np.float32(_NEVER_ZERO)
     return direction
 
 
@@ -183,7 +185,7 @@ def _solid_interval(kind: np.int8, start: F64, components: F64, xs: F32, ys: F32
     if kind == ELLIPSOID:
         return _inside_quadric(start, directions)
     near, far = _inside_quadric(start[[0, 2]], [directions[0], directions[2]])
-    enter, leave = _inside_slab(start[1], directions[1] + 1e-20)
+    enter, leave = _inside_slab(start[1], directions[1] + _NEVER_ZERO)
     return np.maximum(near, enter), np.minimum(far, leave)
 
 
@@ -197,7 +199,7 @@ def _inside_slab(start: float, direction: Float) -> tuple[Float, Float]:
 
 def _inside_quadric(start: F64, directions: list[Float]) -> tuple[Float, Float]:
     """Return where rays enter and leave the unit circle or sphere."""
-    a = sum(d * d for d in directions)
+    a = sum(d * d for d in directions) + _NEVER_ZERO**2
     b = sum(s * d for s, d in zip(start, directions, strict=True))
     root = b * b - a * (start @ start - 1)
     reach = np.sqrt(np.maximum(root, 0)) / a

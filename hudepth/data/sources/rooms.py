@@ -64,11 +64,11 @@ class RoomsSource(Source):
         if not isinstance(size, (tuple, list)) or len(size) != 2 or not all(_is_side(side) for side in size):
             low, high = _SIDE_PX
             raise ConfigError(
-                f"data.size: got {size!r}. Pass [height, width], two whole numbers from {low} to {high}, "
+                f"data.source.size: got {size!r}. Pass [height, width], two whole numbers from {low} to {high}, "
                 "for example [240, 320]."
             )
         if not isinstance(holes, bool):
-            raise ConfigError(f"data.holes: got {holes!r}. Pass true or false.")
+            raise ConfigError(f"data.source.holes: got {holes!r}. Pass true or false.")
         self.size = (size[0], size[1])
         self.holes = holes
 

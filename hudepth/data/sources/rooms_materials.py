@@ -62,17 +62,18 @@ def _hash(cell: NDArray[np.int32]) -> F32:
 
 def _wood(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     across = u / scale
-    plank = np.floor(across).astype(np.int32)
+    plank: F32 = np.floor(across)
     grain = _fibres(across * 60 + plank * 97, v * 22 + plank * 31)
-    weight: F32 = 0.65 * grain + 0.35 * _hash(plank) + 0.6 * ((across - plank) < 0.04) * sharp
+    seam = ((across - plank) < 0.04) * sharp
+    weight: F32 = 0.65 * grain + 0.35 * _hash(plank.astype(np.int32)) + 0.6 * seam
     return weight
 
 
 def _tiles(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     a, b = u / scale, v / scale
-    i, j = np.floor(a).astype(np.int32), np.floor(b).astype(np.int32)
+    i, j = np.floor(a), np.floor(b)
     grout = np.maximum((a - i) < 0.035, (b - j) < 0.035) * sharp
-    weight: F32 = 0.12 * _hash(i * 71 + j) + 0.25 * noise(u * 90, v * 90) + 0.8 * grout
+    weight: F32 = 0.12 * _hash((i * 71 + j).astype(np.int32)) + 0.25 * noise(u * 90, v * 90) + 0.8 * grout
     return weight
 
 

@@ -147,9 +147,8 @@ def _lit_fraction(scene: Scene, point: F32, upwards: F32) -> F32:
     # A standing face spans drop / slope times a cell's width in one cell: with less leave it shades itself.
     slope = np.hypot(a - (_SHADOW_CELLS - 1) / 2, b - (_SHADOW_CELLS - 1) / 2)
     limit = drop[i] * (1 - (1 - np.abs(upwards[i])) * 1.5 / np.maximum(slope, 1)) - np.float32(0.03)
-    column, row = a.astype(np.int32), b.astype(np.int32)
-    across, along = a - column, b - row
-    cell = row * _SHADOW_CELLS + column
+    across, along = a % 1, b % 1
+    cell = b.astype(np.int32) * _SHADOW_CELLS + a.astype(np.int32)
     flat = scene.shadow.ravel()
     near = (flat[cell] > limit) * (1 - across) + (flat[cell + 1] > limit) * across
     far = (flat[cell + _SHADOW_CELLS] > limit) * (1 - across) + (flat[cell + _SHADOW_CELLS + 1] > limit) * across

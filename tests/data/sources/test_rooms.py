@@ -1,0 +1,345 @@
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hudepth.data.sources import rooms
+from hudepth.data.sources.raycast import BOX, CYLINDER, F64, ROOM_FACES, Solids, View, pinhole_view, trace
+from hudepth.data.sources.rooms import RoomsSource, kinect_holes
+from hudepth.data.sources.rooms_scene import build_room
+from hudepth.errors import ConfigError, DataError
+
+SMALL = (48, 64)
+
+
+def digest(source: RoomsSource, index: int) -> str:
+    pair = source.read(source.records()[index])
+    return hashlib.sha256(pair.image.tobytes() + pair.depth.tobytes()).hexdigest()
+
+
+def run_python(code: str) -> str:
+    """Run code in a fresh process, whose sets and dicts are hashed differently, and return what it prints."""
+    environment = {**os.environ, "PYTHONHASHSEED": "17"}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
+
+
+# Records
+
+
+def test_records_are_named_by_scene_and_frame() -> None:
+    records = RoomsSource(scenes=5, frames_per_scene=3).records()
+    assert len(records) == 15
+    assert len({record.id for record in records}) == 15
+    assert (records[11].id, records[11].scene, records[11].frame) == ("room_0003/02", "room_0003", 2)
+    assert {record.category for record in records} == {"bedroom", "kitchen", "office", "living_room"}
+
+
+@pytest.mark.parametrize(("scenes", "tests"), [(2, 1), (3, 1), (5, 1), (10, 2), (48, 10)])
+def test_the_last_fifth_of_the_scenes_is_the_test_split(scenes: int, tests: int) -> None:
+    records = RoomsSource(scenes=scenes, frames_per_scene=4).records()
+    train = {record.scene for record in records if record.split == "train"}
+    test = {record.scene for record in records if record.split == "test"}
+    assert (len(train), len(test)) == (scenes - tests, tests)
+    assert not train & test
+    assert max(train) < min(test)
+
+
+def test_a_single_scene_has_no_split() -> None:
+    assert {record.split for record in RoomsSource(scenes=1).records()} == {""}
+
+
+# Determinism
+
+
+def test_a_frame_is_the_same_in_any_order_instance_and_after_pickling() -> None:
+    source = RoomsSource(scenes=4, frames_per_scene=2, size=SMALL, holes=True)
+    forwards = [digest(source, i) for i in range(8)]
+    build_room.cache_clear()
+    copy = pickle.loads(pickle.dumps(source))
+    assert [digest(copy, i) for i in reversed(range(8))] == forwards[::-1]
+    assert len(set(forwards)) == 8
+
+
+def test_a_frame_does_not_depend_on_how_many_there_are() -> None:
+    few, many = RoomsSource(scenes=2, frames_per_scene=1, size=SMALL), RoomsSource(scenes=9, size=SMALL)
+    np.testing.assert_array_equal(few.read(few.records()[1]).image, many.read(many.records()[5]).image)
+
+
+def test_a_frame_is_the_same_in_another_process() -> None:
+    code = (
+        "import hashlib; from hudepth.data.sources.rooms import RoomsSource; s = RoomsSource(size=(48, 64));"
+        "p = s.read(s.records()[7]); print(hashlib.sha256(p.image.tobytes() + p.depth.tobytes()).hexdigest())"
+    )
+    assert run_python(code).strip() == digest(RoomsSource(size=SMALL), 7)
+
+
+def test_another_seed_gives_other_rooms() -> None:
+    assert digest(RoomsSource(size=SMALL), 0) != digest(RoomsSource(size=SMALL, seed=1), 0)
+
+
+def test_the_fingerprint_covers_all_that_changes_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = RoomsSource(size=SMALL)
+    others = [
+        RoomsSource(size=(48, 65)),
+        RoomsSource(size=SMALL, seed=1),
+        RoomsSource(size=SMALL, holes=True),
+        RoomsSource(size=SMALL, scenes=47),
+        RoomsSource(size=SMALL, frames_per_scene=6),
+    ]
+    prints = [source.fingerprint() for source in (base, *others)]
+    assert len(set(prints)) == len(prints)
+    assert RoomsSource(size=list(SMALL)).fingerprint() == prints[0]
+    monkeypatch.setattr(rooms, "RENDERER_VERSION", rooms.RENDERER_VERSION + 1)
+    assert base.fingerprint() != prints[0]
+
+
+# Exact depth
+
+
+def scalar_depth(view: View, room: F64, solids: Solids, row: int, column: int) -> float:
+    """First hit by plane equations and roots, one ray and one solid at a time, in plain Python."""
+    x, y = float(view.xs[column]), float(view.ys[row])
+    ray = [x * view.axes[0][k] + y * view.axes[1][k] + view.axes[2][k] for k in range(3)]
+    hits = [((room[k] if ray[k] > 0 else 0.0) - view.origin[k]) / ray[k] for k in range(3)]
+    for kind, centre, half, yaw in zip(*solids, strict=True):
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        p = [view.origin[k] - centre[k] for k in range(3)]
+        o = [p[0] * cos - p[2] * sin, p[1], p[0] * sin + p[2] * cos]
+        d = [ray[0] * cos - ray[2] * sin, ray[1], ray[0] * sin + ray[2] * cos]
+        round_axes = {BOX: [], CYLINDER: [0, 2]}.get(int(kind), [0, 1, 2])
+        for k in {BOX: [0, 1, 2], CYLINDER: [1]}.get(int(kind), []):
+            for side in (-half[k], half[k]):
+                t = (side - o[k]) / d[k]
+                at = [(o[j] + t * d[j]) / half[j] for j in range(3)]
+                flat = math.hypot(at[0], at[2]) if kind == CYLINDER else max(abs(at[j]) for j in range(3) if j != k)
+                if t > 0 and flat <= 1:
+                    hits.append(t)
+        if round_axes:
+            a = sum((d[k] / half[k]) ** 2 for k in round_axes)
+            b = 2 * sum(o[k] * d[k] / half[k] ** 2 for k in round_axes)
+            c = sum((o[k] / half[k]) ** 2 for k in round_axes) - 1
+            if b * b >= 4 * a * c:
+                t = (-b - math.sqrt(b * b - 4 * a * c)) / (2 * a)
+                if t > 0 and (kind != CYLINDER or abs(o[1] + t * d[1]) <= half[1]):
+                    hits.append(t)
+    return float(min(hits))
+
+
+@pytest.mark.parametrize("index", [1, 8, 14, 38])
+def test_depth_agrees_with_one_ray_at_a_time(index: int) -> None:
+    source = RoomsSource(size=(120, 160))
+    record = source.records()[index]
+    room = build_room(0, index // 5)
+    view = pinhole_view(*room.path.pose(record.frame), height=120, width=160)
+    depth = source.read(record).depth
+    _, surface = trace(view, room.scene.room_size, room.scene.solids)
+    kinds = np.concatenate([np.full(ROOM_FACES, BOX), room.scene.solids.kind])[surface]
+    rng = np.random.default_rng(index)
+    pixels = [
+        tuple(rng.choice(np.argwhere(mask))) for mask in (kinds != BOX, surface >= 6, surface < 6) for _ in range(25)
+    ]
+    truth = [scalar_depth(view, room.scene.room_size, room.scene.solids, r, c) for r, c in pixels]
+    traced = [float(depth[r, c]) for r, c in pixels]
+    close = np.isclose(traced, truth, rtol=1e-5)
+    assert (~close).sum() <= 1  # a ray that grazes a silhouette may fall on either side of it
+
+
+def test_the_floor_back_projects_to_a_plane() -> None:
+    source = RoomsSource(size=(96, 128))
+    fx, fy, cx, cy = source.intrinsics
+    for index in (0, 6, 13):
+        record = source.records()[index]
+        room = build_room(0, index // 5)
+        origin, axes = room.path.pose(record.frame)
+        view = pinhole_view(origin, axes, height=96, width=128)
+        _, surface = trace(view, room.scene.room_size, room.scene.solids)
+        z = source.read(record).depth.astype(np.float64)
+        v, u = np.mgrid[:96, :128]
+        points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], -1) @ axes + origin
+        floor = surface == 2
+        assert floor.sum() > 100
+        np.testing.assert_allclose(points[floor][:, 1], 0, atol=1e-4)
+        assert (points > -1e-4).all()
+        assert (points < room.scene.room_size + 1e-4).all()
+
+
+# What the rooms are like
+
+
+@pytest.fixture(scope="module")
+def gallery() -> list[Any]:
+    source = RoomsSource(scenes=16, frames_per_scene=1, size=SMALL)
+    return [source.read(record) for record in source.records()]
+
+
+def test_pairs_have_the_promised_types(gallery: list[Any]) -> None:
+    for pair in gallery:
+        assert pair.image.shape == (*SMALL, 3)
+        assert pair.image.dtype == np.uint8
+        assert pair.depth.shape == SMALL
+        assert pair.depth.dtype == np.float32
+
+
+def test_depths_are_those_of_rooms(gallery: list[Any]) -> None:
+    depths = np.stack([pair.depth for pair in gallery])
+    medians = np.median(depths, axis=(1, 2))
+    assert np.isfinite(depths).all()
+    assert depths.min() > 0.3
+    assert depths.max() < 10
+    assert 2.0 < np.median(medians) < 3.5
+    assert ((medians > 1.2) & (medians < 6)).all()
+    assert (depths < 0.9).mean(axis=(1, 2)).max() < 0.4  # nothing covers the view
+
+
+def test_images_are_neither_black_nor_burnt_out(gallery: list[Any]) -> None:
+    means = np.array([pair.image.mean() for pair in gallery])
+    assert ((means > 50) & (means < 190)).all()
+    assert np.median([pair.image.std() for pair in gallery]) > 25
+
+
+def test_the_camera_keeps_clear_of_furniture_and_walls() -> None:
+    for scene in range(8):
+        room = build_room(0, scene)
+        solids = room.scene.solids
+        for frame in range(0, 60, 4):
+            origin, _ = room.path.pose(frame)
+            assert 1.0 <= origin[1] <= 1.8
+            assert (origin > 0.1).all()
+            assert (origin < room.scene.room_size - 0.1).all()
+            x, y, z = (origin - solids.centre).T
+            cos, sin = np.cos(solids.yaw), np.sin(solids.yaw)
+            local = np.abs(np.stack([x * cos - z * sin, y, x * sin + z * cos], 1)) - solids.half
+            assert local.max(1).min() > 0.05
+
+
+def test_every_room_is_furnished() -> None:
+    for scene in range(8):
+        room = build_room(0, scene)
+        large = (room.scene.solids.half.prod(1) * 8 > 0.02).sum()
+        assert large >= 5
+        assert room.scene.room_size[[0, 2]].min() >= 3
+        assert room.scene.room_size.max() <= 9
+
+
+def test_neighbours_in_a_scene_are_alike_but_not_the_same() -> None:
+    source = RoomsSource(scenes=8, frames_per_scene=2, size=SMALL)
+    depths = np.stack([source.read(record).depth for record in source.records()])
+    within = np.abs(depths[0::2] - depths[1::2]).mean(axis=(1, 2))
+    across = np.abs(depths[0::2] - np.roll(depths[0::2], 1, axis=0)).mean(axis=(1, 2))
+    assert (within > 0.01).all()
+    assert np.mean(within) < 0.5 * np.mean(across)
+
+
+# Holes
+
+
+def test_holes_only_take_depth_away() -> None:
+    whole = RoomsSource(scenes=4, frames_per_scene=1, size=(120, 160))
+    holed = RoomsSource(scenes=4, frames_per_scene=1, size=(120, 160), holes=True)
+    for record in whole.records():
+        full, part = whole.read(record), holed.read(record)
+        missing = part.depth == 0
+        assert full.depth.min() > 0
+        assert 0.05 < missing.mean() < 0.45
+        assert missing[0].all()
+        assert missing[:, -1].all()
+        np.testing.assert_array_equal(part.depth[~missing], full.depth[~missing])
+        np.testing.assert_array_equal(part.image, full.image)
+
+
+def test_the_projectors_shadow_lies_left_of_a_near_plate_and_is_as_wide_as_its_parallax() -> None:
+    depth = np.full((100, 320), 4.0, np.float32)
+    depth[20:80, 150:200] = 1.0
+    image = np.full((100, 320, 3), 128, np.uint8)
+    holes = kinect_holes(depth, image, fx=260.0, rng=np.random.default_rng(0))
+    width = round(260 * 0.075 * (1 / 1.0 - 1 / 4.0))
+    assert holes[30:70, 152 - width : 150].all()
+    assert holes[30:70, 150 - width - 12 : 150 - width - 3].mean() < 0.2
+    assert holes[30:70, 203:215].mean() < 0.2
+
+
+def test_nothing_is_measured_beyond_the_kinects_range() -> None:
+    depth = np.full((60, 80), 3.0, np.float32)
+    depth[:, 40:] = 8.5
+    holes = kinect_holes(depth, np.full((60, 80, 3), 128, np.uint8), fx=65.0, rng=np.random.default_rng(0))
+    assert holes[:, 40:].all()
+    assert holes[5:-5, 5:35].mean() < 0.3
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scenes": 0}, "data.source.scenes: got 0. Pass a whole number of at least 1."),
+        ({"scenes": True}, "data.source.scenes: got True. Pass a whole number of at least 1."),
+        ({"frames_per_scene": -1}, "data.source.frames_per_scene: got -1. Pass a whole number of at least 1."),
+        ({"seed": -1}, "data.source.seed: got -1. Pass a whole number of at least 0."),
+    ],
+)
+def test_bad_options_say_what_to_do(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        RoomsSource(**options)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("size", [[240], [240, 320, 3], (8, 320), (240, 4096), [True, 320]])
+def test_a_bad_size_says_what_to_do(size: Any) -> None:
+    with pytest.raises(ConfigError) as caught:
+        RoomsSource(size=size)
+    assert str(caught.value) == (
+        f"data.source.size: got {size!r}. Pass [height, width], two whole numbers from 16 to 2048, for example [240, 320]."
+    )
+
+
+def test_options_of_the_wrong_type_say_what_to_do() -> None:
+    # In a process of its own: in this one, the type checker of the tests speaks first.
+    code = """
+from hudepth.data.sources.rooms import RoomsSource
+from hudepth.errors import ConfigError
+for options in ({"scenes": 2.0}, {"seed": None}, {"holes": "no"}, {"size": 240}, {"size": "ab"}, {"size": (24.0, 32)}):
+    try:
+        RoomsSource(**options)
+    except ConfigError as error:
+        print(error)
+"""
+    size = "Pass [height, width], two whole numbers from 16 to 2048, for example [240, 320]."
+    assert run_python(code).splitlines() == [
+        "data.source.scenes: got 2.0. Pass a whole number of at least 1.",
+        "data.source.seed: got None. Pass a whole number of at least 0.",
+        "data.source.holes: got 'no'. Pass true or false.",
+        f"data.source.size: got 240. {size}",
+        f"data.source.size: got 'ab'. {size}",
+        f"data.source.size: got (24.0, 32). {size}",
+    ]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scene": "room_0009", "id": "room_0009/00"},
+        {"frame": 7, "id": "room_0000/07"},
+        {"scene": "attic"},
+        {"frame": -1},
+    ],
+)
+def test_a_record_of_another_source_is_refused(change: dict[str, Any]) -> None:
+    source = RoomsSource(scenes=2, frames_per_scene=2)
+    record = replace(source.records()[0], **change)
+    with pytest.raises(DataError) as caught:
+        source.read(record)
+    assert str(caught.value) == (
+        f"rooms: no frame '{record.id}' in 2 scenes of 2 frames. "
+        "Pass a record that records() of the same source returned."
+    )

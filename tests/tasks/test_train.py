@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from hudepth.checkpoint import read_plain
+
+from .conftest import TINY, Command, script
+
+
+def history(run: Path) -> list[dict[str, str]]:
+    with (run / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def status(run: Path) -> dict[str, Any]:
+    return json.loads((run / "status.json").read_text())
+
+
+def only_run(folder: Path, name: str) -> Path:
+    (run,) = (folder / "runs" / name).iterdir()
+    return run
+
+
+def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
+    files = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
+    expected = {
+        "config.yaml", "overrides.txt", "environment.json", "split.json", "status.json", "train.log", "metrics.csv",
+        "checkpoints/best.ckpt", "checkpoints/last.ckpt", "images/epoch_001.png", "images/epoch_002.png",
+        *(f"test/{protocol}/{name}" for protocol in ("paper", "eigen") for name in ("metrics.json", "per_image.csv", "panels.png")),
+    }  # fmt: skip
+    assert expected <= files
+    assert {name.split("/")[0] for name in files - expected} == {"tensorboard"}
+    assert status(trained)["state"] == "finished"
+    assert (trained / "overrides.txt").read_text().splitlines() == [*TINY, "name=tiny"]
+    config = yaml.safe_load((trained / "config.yaml").read_text())
+    assert config["trainer"]["max_epochs"] == 2
+    assert "${" not in (trained / "config.yaml").read_text()
+    environment = json.loads((trained / "environment.json").read_text())
+    assert environment["packages"]["torch"].startswith(torch.__version__.split("+")[0])
+    rows = history(trained)
+    assert [row["epoch"] for row in rows] == ["1", "2"]
+    for stage in ("train", "val"):
+        total = float(rows[1][f"{stage}/total"])
+        terms = [float(rows[1][f"{stage}/{term}"]) for term in ("boundary", "smoothness", "scaling")]
+        assert total == pytest.approx(3.0 * terms[0] + 1.2 * terms[1] + 1.0 * terms[2], rel=1e-5)
+
+
+def test_the_log_says_that_rooms_are_the_default(trained: Path) -> None:
+    log = (trained / "train.log").read_text()
+    assert "data: built-in rooms (the default)" in log
+    assert "epoch 2 of 2: train/total" in log
+
+
+def test_experiment_changes_values(command: Command) -> None:
+    plain = yaml.safe_load(command("train", "--cfg", "job", "model=tiny").out)
+    for argument in ("experiment=badcl", "+experiment=badcl"):
+        badcl = yaml.safe_load(command("train", "--cfg", "job", argument).out)
+        assert badcl["trainer"]["max_epochs"] == 100 != plain["trainer"]["max_epochs"]
+        assert badcl["model"]["weights"] == "imagenet"
+        assert (badcl["optim"]["lr"], badcl["data"]["batch_size"], badcl["seed"]) == (1e-4, 8, 42)
+
+
+def test_multirun_makes_a_run_directory_for_each_job(command: Command, tmp_path: Path) -> None:
+    done = command("train", "-m", *TINY, "name=sweep", "loss=l1,l2", "trainer.max_epochs=1", "test=false")
+    assert done.code == 0, done.err
+    (sweep,) = (tmp_path / "sweeps" / "sweep").iterdir()
+    for job, loss in (("0", "l1"), ("1", "l2")):
+        assert status(sweep / job)["state"] == "finished"
+        assert f"train/{loss}" in history(sweep / job)[0]
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_failing_job_of_a_sweep_stops_no_other(command: Command, tmp_path: Path) -> None:
+    done = command("train", "-m", *TINY, "name=sweep", "optim.lr=-1,1e-3", "trainer.max_epochs=1", "test=false")
+    assert done.code == 1
+    assert "hudepth-train: job 0: torch.optim.AdamW: Invalid learning rate: -1" in done.err
+    assert done.err.splitlines()[-1] == "hudepth-train: 1 jobs failed: 0. What each said stands above."
+    (sweep,) = (tmp_path / "sweeps" / "sweep").iterdir()
+    assert status(sweep / "0")["state"] == "failed"
+    assert "Invalid learning rate" in status(sweep / "0")["error"]
+    assert "Traceback" in (sweep / "0" / "train.log").read_text()
+    assert status(sweep / "1")["state"] == "finished"
+
+
+def test_a_loss_that_is_not_finite_names_its_batch(command: Command, tmp_path: Path) -> None:
+    done = command("train", *TINY, "name=exploding", "optim.lr=1e30", "loss=l2", "model=tiny", "trainer.max_epochs=3")
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith("hudepth-train: the loss is nan in epoch 1, batch ")
+    assert "of the pairs room_00" in done.err
+    assert status(only_run(tmp_path, "exploding"))["state"] == "failed"
+
+
+def test_a_root_that_is_missing_gives_one_line(command: Command) -> None:
+    done = command("train", "data=nyu_labeled", "data.root=nowhere", "model=tiny")
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        "hudepth-train: data.root: 'nowhere' does not exist. Pass data.root=<folder with index.csv>, or run with data=rooms."
+    )
+
+
+def test_a_split_that_leaves_a_subset_empty_gives_one_line(command: Command) -> None:
+    done = command("train", *TINY, "data.split=random", "data.fractions=[1.0,0.0,0.0]")
+    assert done.code == 1
+    assert "data.split=random: the val subset is empty (12 pairs" in done.err.splitlines()[-1]
+
+
+def test_an_output_that_cannot_be_written_gives_one_line(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "runs").write_text("in the way")
+    done = command("train", *TINY)
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith("hudepth-train: paths.runs: cannot make 'runs/default/")
+    assert done.err.splitlines()[-1].endswith("Pass paths.runs=<a folder you can write to>.")
+
+
+def test_a_size_the_network_cannot_take_gives_the_nearest(command: Command) -> None:
+    done = command("train", *TINY, "data.size=[40,48]")
+    assert done.code == 1
+    assert done.err.splitlines()[-1].endswith("Pass data.size=[32,48] or [48,48].")
+
+
+def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
+    done = command(
+        "train", *TINY, "name=stop", "callbacks=early_stopping", "callbacks.panels=0", "schedule=cosine", "test=false",
+        "callbacks.early_stopping.patience=1", "callbacks.early_stopping.min_delta=100", "trainer.max_epochs=9",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert len(history(only_run(tmp_path, "stop"))) == 2
+
+
+def test_resume_refuses_what_it_cannot_do(command: Command, trained: Path, tmp_path: Path) -> None:
+    assert "is no run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
+    (tmp_path / "config.yaml").write_text("a: 1\n")
+    done = command("train", f"resume={tmp_path}")
+    assert done.err.splitlines()[-1].endswith("has no finished epoch to continue from. Train anew, without resume=.")
+    done = command("train", f"resume={trained}", "loss=l1")
+    assert done.code == 1
+    assert "resume: 'loss=l1' cannot be changed when a run is continued" in done.err.splitlines()[-1]
+
+
+def test_resume_adds_epochs_to_a_finished_run(command: Command, tmp_path: Path) -> None:
+    """Two epochs and one more are bit for bit three epochs."""
+    options = (*TINY, "test=false", "callbacks.panels=0", "logger=none")
+    assert command("train", *options, "name=two").code == 0
+    assert command("train", *options, "name=three", "trainer.max_epochs=3").code == 0
+    two, three = only_run(tmp_path, "two"), only_run(tmp_path, "three")
+    done = command("train", f"resume={two}", "trainer.max_epochs=3")
+    assert done.code == 0, done.err
+    assert_same_end(two, three)
+
+
+def assert_same_end(run: Path, reference: Path) -> None:
+    assert (run / "metrics.csv").read_bytes() == (reference / "metrics.csv").read_bytes()
+    ours, theirs = (read_plain(r / "checkpoints" / "last.ckpt") for r in (run, reference))
+    assert ours["epoch"] == theirs["epoch"]
+    assert ours["global_step"] == theirs["global_step"]
+    assert_equal(ours["state_dict"], theirs["state_dict"])
+    assert_equal(ours["optimizer_states"], theirs["optimizer_states"])
+    best, best_reference = (read_plain(r / "checkpoints" / "best.ckpt") for r in (run, reference))
+    assert best["epoch"] == best_reference["epoch"]
+    assert_equal(best["state_dict"], best_reference["state_dict"])
+
+
+def assert_equal(a: Any, b: Any) -> None:
+    assert type(a) is type(b)
+    if isinstance(a, torch.Tensor):
+        assert torch.equal(a, b)
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_equal(a[key], b[key])
+    elif isinstance(a, list):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_equal(x, y)
+    else:
+        assert a == b
+
+
+def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(tmp_path: Path, cache: Path) -> None:
+    options = [*TINY, "test=false", "schedule=cosine", "callbacks.panels=0", "logger=none", "trainer.max_epochs=100", "seed=7"]
+    assert subprocess.run(**script("train", *options, "name=whole", cwd=tmp_path, cache=cache), check=False).returncode == 0
+    reference = only_run(tmp_path, "whole")
+
+    chance = random.Random(0)
+    arguments, kills = [*options, "name=killed"], 0
+    for _ in range(2):
+        process = subprocess.Popen(**script("train", *arguments, cwd=tmp_path, cache=cache))
+        wait_for_epoch(process, tmp_path, at_least=1 + 20 * kills)
+        time.sleep(chance.uniform(0, 0.3))
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.communicate()
+        run = only_run(tmp_path, "killed")
+        assert status(run)["state"] == "running" or status(run)["state"] == "finished"
+        arguments = [f"resume={run}"]
+    assert kills
+    done = subprocess.run(**script("train", *arguments, cwd=tmp_path, cache=cache), check=False)
+    assert done.returncode == 0, done.stdout
+    assert status(run)["state"] == "finished"
+    assert len(history(run)) == 100
+    assert_same_end(run, reference)
+
+
+def wait_for_epoch(process: subprocess.Popen[str], folder: Path, *, at_least: int) -> None:
+    """Wait until the run's newest checkpoint is of an epoch later than it was, or the process has ended."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        for run in (folder / "runs" / "killed").glob("*"):
+            if (run / "checkpoints" / "last.ckpt").exists() and len(history(run)) >= at_least:
+                return
+        time.sleep(0.02)
+
+
+def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path, cache: Path) -> None:
+    process = subprocess.Popen(
+        **script("train", *TINY, "name=killed", "trainer.max_epochs=1000", "test=false", cwd=tmp_path, cache=cache)
+    )
+    wait_for_epoch(process, tmp_path, at_least=1)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    run = only_run(tmp_path, "killed")
+    assert process.returncode != 0
+    assert f"interrupted; continue with: hudepth-train resume={run}" in out
+    assert "Traceback" not in out
+    assert status(run)["state"] == "interrupted"

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hudepth import cli
+from hudepth.errors import ConfigError
+
+BIN = Path(sys.executable).parent
+
+
+def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(BIN / f"hudepth-{task}"), *arguments], cwd=cwd, text=True, capture_output=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "message"),
+    [
+        ("train", ["model.headz=3"], "no key 'model.headz'. Did you mean 'model.attention_heads'? See"),
+        ("train", ["trainer.max_epoch=3"], "no key 'trainer.max_epoch'. Did you mean 'trainer.max_epochs'? See"),
+        ("train", ["loss=silog", "loss.variance_focuss=1"], "no key 'loss.variance_focuss'. Did you mean 'loss.variance_focus'?"),
+        ("train", ["lss=l1"], "no key 'lss'. Did you mean 'loss'? See"),
+        ("train", ["data=nyu_labelled"], "data: no 'nyu_labelled'. Did you mean 'nyu_labeled'? Pass one of densedepth, "),
+        ("train", ["experiment=badcll"], "experiment: no 'badcll'. Did you mean 'badcl'? Pass one of badcl, demo."),
+        ("train", ["+experiment=demoo"], "experiment: no 'demoo'. Did you mean 'demo'? Pass one of badcl, demo."),
+        ("train", ["-m", "loss=badcl,l3"], "loss: no 'l3'. Pass one of badcl, berhu, l1, l2, silog."),
+        ("train", ["just words"], "cannot read 'just words': write key=value, and quote values with special characters"),
+        ("test", [], "checkpoint is not set. Pass checkpoint=<file | run directory | last>."),
+        ("test", ["checkpoint=nowhere.ckpt"], "checkpoint: no file or run directory 'nowhere.ckpt'. Pass a file, a run"),
+        ("test", ["checkpoint=last"], "checkpoint=last: no run with a checkpoint below 'runs'. Train one with hudepth-train,"),
+        ("data", [], "a verb is missing. Type hudepth-data prepare or hudepth-data info."),
+        ("data", ["inf"], "no verb 'inf'. Did you mean 'info'? Type hudepth-data prepare or hudepth-data info."),
+        ("data", ["prepare", "data=nyu_labeled"], "data.root is not set. Pass data.root=<"),
+    ],
+)  # fmt: skip
+def test_a_mistake_gives_one_line_and_exit_code_1(
+    task: str, arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    from hydra.core.global_hydra import GlobalHydra
+
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [f"hudepth-{task}", *arguments])
+    assert getattr(cli, task)() == 1
+    captured = capfd.readouterr()
+    lines = [line for line in captured.err.splitlines() if line]
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith(f"hudepth-{task}: {message}")
+    assert "Traceback" not in captured.err + captured.out
+    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert left == (["multirun.yaml"] if "-m" in arguments else [])  # else a mistake leaves nothing behind
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    done = run("test", "checkpoint=nowhere.ckpt", "debug=true", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr
+    assert "CheckpointError: checkpoint: no file" in done.stderr
+
+
+@pytest.mark.parametrize("task", ["train", "test", "data"])
+def test_help_is_our_own_and_loads_no_torch(task: str, tmp_path: Path) -> None:
+    code = f"import sys; from hudepth import cli; sys.argv[1:] = ['--help']; cli.{task}(); print('torch' in sys.modules, 'hydra' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, text=True, capture_output=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False False"
+    assert f"hudepth-{task}" in done.stdout
+    assert done.stdout.count("  hudepth-") >= 6  # the usage and five examples
+    assert "nyu_labeled" in done.stdout
+
+
+def test_cfg_prints_the_configuration_without_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys; from hudepth import cli; sys.argv[1:] = ['experiment=badcl', '--cfg', 'job']; cli.train(); "
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, text=True, capture_output=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
+    assert "max_epochs: 100" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_tab_completion(tmp_path: Path) -> None:
+    script = """
+    PATH={bin}:$PATH
+    eval "$(hudepth-train -sc install=bash)"
+    complete -p hudepth-train >/dev/null || exit 3
+    COMP_LINE="hudepth-train loss=" COMP_POINT=19 COMP_CWORD=1
+    hydra_bash_completion
+    echo "${{COMPREPLY[@]}}"
+    """.format(bin=BIN)
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, text=True, capture_output=True, check=False)
+    assert "loss=berhu" in done.stdout, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("task", "typed", "rewritten"),
+    [
+        ("train", ["experiment=x", "a.b=1"], ["+experiment=x", "a.b=1"]),
+        ("train", ["+experiment=x", "sweep=y"], ["+experiment=x", "+sweep=y"]),
+        ("data", ["prepare", "data=rooms"], ["verb=prepare", "data=rooms"]),
+        ("data", ["data=rooms", "info"], ["data=rooms", "verb=info"]),
+        ("test", ["checkpoint=x", "data.root=y"], ["checkpoint=x", "++data.root=y"]),
+        ("test", ["checkpoint=x", "data=rooms", "data.seed=1"], ["checkpoint=x", "data=rooms", "data.seed=1"]),
+    ],
+)
+def test_rewrite(task: str, typed: list[str], rewritten: list[str]) -> None:
+    assert cli.rewrite(task, typed) == rewritten
+
+
+def test_rewrite_refuses_an_unknown_verb() -> None:
+    with pytest.raises(ConfigError, match=r"^no verb 'prepar'\. Did you mean 'prepare'\?"):
+        cli.rewrite("data", ["prepar"])
+
+
+def test_an_unforeseen_error_is_one_line_too() -> None:
+    assert cli.one_line(KeyError("x"), "train") == "KeyError: 'x' (debug=true shows the traceback)"
