@@ -20,13 +20,10 @@ log = logging.getLogger("hudepth")
 
 
 def setup_logging() -> None:
-    """Send hudepth's log lines to standard error, once."""
-    if not log.handlers:
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("%(message)s"))
-        log.addHandler(handler)
-        log.setLevel(logging.INFO)
-        log.propagate = False
+    """Send hudepth's log lines to what is standard error now, and nowhere else."""
+    log.handlers[:] = [logging.StreamHandler(sys.stderr)]
+    log.setLevel(logging.INFO)
+    log.propagate = False
 
 
 def track(items: Iterable[T], *, total: int, what: str) -> Iterator[T]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 from hudepth.data.dataset import ShardSampler, StoreDataset, as_is
 from hudepth.data.prepare import prepare
 from hudepth.data.sources.base import Source
-from hudepth.data.splits import Split, make_split
+from hudepth.data.splits import Split, check_split, make_split
 from hudepth.data.store import DepthStore
 from hudepth.errors import ConfigError
 from hudepth.normalise import normalise_image
@@ -62,9 +63,15 @@ class DepthDataModule(LightningDataModule):
         super().__init__()
         if len(size) != 2 or min(size) < 1:
             raise ConfigError(f"data.size: {list(size)} is not [height,width]. Pass data.size=[224,224].")
-        if batch_size < 1:
-            raise ConfigError(f"data.batch_size: {batch_size} is less than 1.")
-        if max_depth_m <= 0:
+        check_split(split, fractions)
+        for key, value, least in (
+            ("batch_size", batch_size, 1),
+            ("num_workers", num_workers, 0),
+            ("prepare_workers", prepare_workers, 1),
+        ):
+            if value is not None and value < least:
+                raise ConfigError(f"data.{key}: {value} is less than {least}.")
+        if not 0 < max_depth_m < math.inf:
             raise ConfigError(f"data.max_depth_m: {max_depth_m} is not a positive number of metres.")
         self.source = source
         self.size = (int(size[0]), int(size[1]))

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -84,9 +86,9 @@ def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, nativ
 
 def prepare_pairs(
     source: Source, records: Sequence[Record], size: tuple[int, int], *, native: bool, workers: int | None
-) -> Iterator[tuple[Record, PreparedPair | str]]:
+) -> Generator[tuple[Record, PreparedPair | str], None, None]:
     """Yield each record with its prepared pair, or with the line that says why there is none; in order."""
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or _cores()
     if workers == 1 or len(records) < POOL_FROM:
         for record in records:
             yield record, _outcome(source, record, size, native=native)
@@ -113,6 +115,11 @@ def prepare_pairs(
                 future.cancel()
 
 
+def _cores() -> int:
+    """Cores this process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _outcome(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair | str:
     try:
         return prepare_pair(source, record, size, native=native)
@@ -124,8 +131,18 @@ _worker: dict[str, Any] = {}
 
 
 def _start_worker(source: Source, size: tuple[int, int], native: bool) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers; they need not say so
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(1)  # one process per core already
     _worker.update(source=source, size=size, native=native)
+
+
+def _end_with_parent() -> None:
+    """A pool's processes outlive a parent that was killed: they wait for work that never comes."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _work(record: Record) -> PreparedPair | str:

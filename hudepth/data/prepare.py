@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import shutil
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +31,8 @@ def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Pa
     Raises:
         DataError: if the source's root or index cannot be read.
     """
-    newest = max((file.stat().st_mtime_ns for file in source.files() if file.exists()), default=0)
-    key = [VERSION, source.name, source.fingerprint(), newest, size, source.encoding, native]
+    times = [file.stat().st_mtime_ns for file in source.files() if file.exists()]
+    key = [VERSION, source.name, source.fingerprint(), times, size, source.encoding, native]
     return cache / f"{source.name}-{size[0]}x{size[1]}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
 
 
@@ -64,11 +67,12 @@ def prepare(
         raise ConfigError(f"data.on_error: no '{on_error}'. Pass raise or skip.")
     path = store_path(source, size=size, native=native, cache=Path(cache).expanduser())
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(path.with_suffix(".lock")):
-            if not path.exists():
-                _remove_leftovers(path)
-                _build(source, path, size=size, native=native, on_error=on_error, workers=workers)
+        if not path.exists():  # first without the lock, which a cache that can only be read has no place for
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(path.with_suffix(".lock")):
+                if not path.exists():
+                    _remove_leftovers(path)
+                    _build(source, path, size=size, native=native, on_error=on_error, workers=workers)
     except OSError as error:
         raise DataError(
             f"paths.cache: cannot write '{path}' ({error.strerror or error}). "
@@ -94,20 +98,24 @@ def _build(
 ) -> None:
     records = source.records()
     _check_units(source, records)
+    _check_space(path.parent, len(records), size)
     skipped: list[str] = []
     pairs: list[PreparedPair] = []  # the small figures only: pixels are dropped once written
     with written_whole(path) as part:
         writer = StoreWriter(part, size=size, native=native)
         try:
-            outcomes = prepare_pairs(source, records, size, native=native, workers=workers)
-            for record, outcome in track(outcomes, total=len(records), what=f"preparing {source.name}"):
-                if isinstance(outcome, str):
-                    if on_error == "raise":
-                        raise DataError(f"{outcome} Mend it, or pass data.on_error=skip to go on without such pairs.")
-                    skipped.append(outcome)
-                    continue
-                writer.append(record, outcome.image, outcome.depth_mm, outcome.native_png)
-                pairs.append(_figures(outcome))
+            # closing: an error below must end the processes at once, not when its traceback is forgotten
+            with closing(prepare_pairs(source, records, size, native=native, workers=workers)) as outcomes:
+                for record, outcome in track(outcomes, total=len(records), what=f"preparing {source.name}"):
+                    if isinstance(outcome, str):
+                        if on_error == "raise":
+                            raise DataError(
+                                f"{outcome} Mend it, or pass data.on_error=skip to go on without such pairs."
+                            )
+                        skipped.append(outcome)
+                        continue
+                    writer.append(record, outcome.image, outcome.depth_mm, outcome.native_png)
+                    pairs.append(_figures(outcome))
             if not pairs:
                 raise DataError(f"{source.name}: none of {len(records)} pairs could be read; the first: {skipped[0]}")
             info = _info(source, pairs, skipped)
@@ -123,15 +131,27 @@ def _check_units(source: Source, records: Sequence[Record]) -> None:
     if not records:
         raise DataError(f"{source.name}: the set is empty. Check data.root.")
     step = max(1, len(records) // UNIT_SAMPLES)
-    depths = []
+    depths, refused = [], []
     for record in records[::step][:UNIT_SAMPLES]:
         try:
             raw = source.read(record).depth
         except DataError:
-            continue  # a bad file is dealt with in its turn; a wrong encoding is wrong for all
-        depths.append(read_metres(source, record, raw))
+            continue  # a bad file is dealt with in its turn
+        try:
+            depths.append(read_metres(source, record, raw))
+        except DataError as error:
+            refused.append(error)
+    if refused and not depths:  # not one bad file but the wrong encoding for all
+        raise refused[0]
     if any((depth > 0).any() for depth in depths):
         check_range(depths, indoor=source.indoor, encoding=source.encoding, name=source.name)
+
+
+def _check_space(folder: Path, pairs: int, size: tuple[int, int]) -> None:
+    """Refuse a disk that has no room for the images and depths, before it is full."""
+    needed, free = 5 * pairs * size[0] * size[1], shutil.disk_usage(folder).free
+    if needed > free:
+        raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
 
 
 def _figures(pair: PreparedPair) -> PreparedPair:

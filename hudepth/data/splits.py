@@ -70,10 +70,7 @@ def make_split(
         ConfigError: for an unknown kind or fractions that do not sum to 1.
         DataError: if the records lack what the kind needs, or a subset is left empty.
     """
-    if kind not in _KINDS:
-        raise ConfigError(f"data.split: no '{kind}'.{did_you_mean(kind, _KINDS)} Pass one of {', '.join(_KINDS)}.")
-    if len(fractions) != 3 or min(fractions) < 0 or abs(sum(fractions) - 1) > 1e-6:
-        raise ConfigError(f"data.fractions: {list(fractions)} are not three shares that sum to 1, as [0.7,0.1,0.2] do.")
+    check_split(kind, fractions)
     subsets = dict(zip(SUBSETS, _KINDS[kind](records, seed, fractions), strict=True))
     for name, indices in subsets.items():
         if not indices:
@@ -89,6 +86,19 @@ def make_split(
         **subsets,
         sha256=_hash({name: [records[i].id for i in indices] for name, indices in subsets.items()}),
     )
+
+
+def check_split(kind: str, fractions: Sequence[float]) -> None:
+    """Accept what :func:`make_split` can work with.
+
+    Raises:
+        ConfigError: for an unknown kind or fractions that do not sum to 1.
+    """
+    if kind not in _KINDS:
+        raise ConfigError(f"data.split: no '{kind}'.{did_you_mean(kind, _KINDS)} Pass one of {', '.join(_KINDS)}.")
+    # "not <=" rather than ">": a NaN is refused too
+    if len(fractions) != 3 or min(fractions) < 0 or not abs(sum(fractions) - 1) <= 1e-6:
+        raise ConfigError(f"data.fractions: {list(fractions)} are not three shares that sum to 1, as [0.7,0.1,0.2] do.")
 
 
 def _permutation(n: int, seed: int) -> list[int]:
@@ -167,7 +177,8 @@ def load_split(path: Path, records: Sequence[Record]) -> Split:
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
         ids: dict[str, list[str]] = {name: [str(i) for i in saved["ids"][name]] for name in SUBSETS}
-        kind, seed, fractions, sha256 = saved["kind"], saved["seed"], saved["fractions"], saved["sha256"]
+        kind, seed, sha256 = str(saved["kind"]), int(saved["seed"]), str(saved["sha256"])
+        train, val, test = (float(share) for share in saved["fractions"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"'{path}' is no split.json ({type(error).__name__}: {error}).") from error
     if _hash(ids) != sha256:
@@ -180,4 +191,4 @@ def load_split(path: Path, records: Sequence[Record]) -> Split:
             "Pass the data= and data.root= it was trained on."
         )
     found = {name: [position[i] for i in ids[name]] for name in SUBSETS}
-    return Split(kind=kind, seed=seed, fractions=tuple(fractions), **found, sha256=sha256)
+    return Split(kind=kind, seed=seed, fractions=(train, val, test), **found, sha256=sha256)

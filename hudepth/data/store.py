@@ -16,8 +16,12 @@ A file without it was never finished; since stores are renamed into place only w
 
 from __future__ import annotations
 
+import errno
 import json
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.data.sources.base import Record
+from hudepth.data.sources.files import PerProcess
 from hudepth.errors import DataError
 
 FORMAT = "hudepth-depth-store"
@@ -48,11 +53,32 @@ def to_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.maximum(mm, depth_m > 0).astype(np.uint16)
 
 
+@contextmanager
+def _plain_os_errors() -> Iterator[None]:
+    """Say what went wrong in a few words: HDF5 spreads a full disk over several lines, at times as a RuntimeError."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        found = re.search(r"errno = (\d+)", str(error))
+        code = int(found[1]) if found else getattr(error, "errno", None) or errno.EIO
+        raise OSError(code, os.strerror(code)) from error
+
+
 class StoreWriter:
-    """Writes a depth store pair by pair. Use it inside :func:`hudepth.files.written_whole`."""
+    """Writes a depth store pair by pair. Use it inside :func:`hudepth.files.written_whole`.
+
+    Args:
+        path: the file, overwritten.
+        size: (height, width) of images and depths.
+        native: whether each pair brings its truth at native resolution.
+
+    Raises:
+        OSError: from here and from every method, if the file cannot be written.
+    """
 
     def __init__(self, path: Path, *, size: tuple[int, int], native: bool) -> None:
-        self._file = h5py.File(path, "w", libver="latest")
+        with _plain_os_errors():
+            self._file = h5py.File(path, "w", libver="latest")
         height, width = size
         self._image = self._file.create_dataset(
             "image", (0, height, width, 3), "u1", maxshape=(None, height, width, 3), chunks=(1, height, width, 3)
@@ -73,45 +99,60 @@ class StoreWriter:
         depth_mm: NDArray[np.uint16],
         native_png: NDArray[np.uint8] | None,
     ) -> None:
-        """Add one pair at training size, with its native truth as an encoded 16-bit PNG if the store has them."""
+        """Add one pair at training size, with its native truth as an encoded 16-bit PNG if the store has them.
+
+        Raises:
+            ValueError: if the store has native truth and the pair brings none, or the other way round.
+        """
+        if self._native != (native_png is not None):
+            raise ValueError(f"'{record.id}': native truth must be given for each pair of a store or for none.")
         row = len(self._records)
-        if row == len(self._image):  # grow by doubling: a resize rewrites the index of chunks
-            for dataset in (self._image, self._depth):
-                dataset.resize(max(64, 2 * row), axis=0)
-        self._image[row] = image
-        self._depth[row] = depth_mm
-        if self._native and native_png is not None:
-            start = self._ends[-1] if self._ends else 0
-            self._png.resize(start + len(native_png), axis=0)
-            self._png[start:] = native_png
-            self._ends.append(start + len(native_png))
+        with _plain_os_errors():
+            if row == len(self._image):  # grow by doubling: a resize rewrites the index of chunks
+                for dataset in (self._image, self._depth):
+                    dataset.resize(max(64, 2 * row), axis=0)
+            self._image[row] = image
+            self._depth[row] = depth_mm
+            if native_png is not None:
+                start = self._ends[-1] if self._ends else 0
+                self._png.resize(start + len(native_png), axis=0)
+                self._png[start:] = native_png
+                self._ends.append(start + len(native_png))
         self._records.append(record)
 
     def close(self, info: dict[str, Any]) -> None:
         """Write the records and ``info``, and close the file."""
-        n = len(self._records)
-        for dataset in (self._image, self._depth):
-            dataset.resize(n, axis=0)
-        if self._native:
-            self._file["native/end"] = np.array(self._ends, dtype=np.int64)
-        for field in ("id", "scene", "split", "category"):
-            values = [getattr(record, field).encode() for record in self._records]
-            self._file[f"records/{field}"] = np.array(values, dtype=h5py.string_dtype())
-        self._file["records/frame"] = np.array([record.frame for record in self._records], dtype=np.int64)
-        self._file.attrs["format"] = FORMAT
-        self._file.attrs["version"] = VERSION
-        self._file.attrs["info"] = json.dumps(info)
-        self._file.close()
+        with _plain_os_errors():
+            for dataset in (self._image, self._depth):
+                dataset.resize(len(self._records), axis=0)
+            if self._native:
+                self._file["native/end"] = np.array(self._ends, dtype=np.int64)
+            for field in ("id", "scene", "split", "category"):
+                values = [getattr(record, field).encode() for record in self._records]
+                self._file[f"records/{field}"] = np.array(values, dtype=h5py.string_dtype())
+            self._file["records/frame"] = np.array([record.frame for record in self._records], dtype=np.int64)
+            self._file.attrs["format"] = FORMAT
+            self._file.attrs["version"] = VERSION
+            self._file.attrs["info"] = json.dumps(info)
+            self._file.flush()  # a flush that fails can be aborted, a close that fails cannot
+            self._file.close()
 
     def abort(self) -> None:
-        """Close the file as it is; without its ``info`` nothing will take it for a store."""
-        self._file.close()
+        """Close the file without writing what is not written yet; nothing will take it for a store."""
+        if not self._file:
+            return
+        # HDF5 cannot drop what it holds back, and crashes at exit if it cannot write it: let it write to nowhere.
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        os.dup2(nowhere, self._file.id.get_vfd_handle())
+        os.close(nowhere)
+        with suppress(OSError, RuntimeError):  # a flush that stopped half-way leaves HDF5 confused, but closed
+            self._file.close()
 
 
 class DepthStore:
     """A depth store, opened for reading.
 
-    It can be handed to worker processes: the HDF5 handle is opened on first use in each and never pickled.
+    It can be handed to worker processes: each opens its own HDF5 handle on first use.
 
     Args:
         path: the file.
@@ -122,7 +163,7 @@ class DepthStore:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._file: h5py.File | None = None
+        self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)
         try:
             with h5py.File(self.path, "r") as file:
                 if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
@@ -134,28 +175,19 @@ class DepthStore:
                 columns = {field: file[f"records/{field}"].asstr()[:] for field in ("id", "scene", "split", "category")}
                 frames = file["records/frame"][:]
                 self.has_native = "native" in file
-        except (OSError, KeyError, json.JSONDecodeError) as error:
+            self.records = [
+                Record(id=i, scene=s, frame=int(f), split=p, category=c)
+                for i, s, f, p, c in zip(
+                    columns["id"], columns["scene"], frames, columns["split"], columns["category"], strict=True
+                )
+            ]
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"'{self.path}' cannot be read as a depth store ({error}). Delete it and prepare again."
             ) from error
-        self.records = [
-            Record(id=i, scene=s, frame=int(f), split=p, category=c)
-            for i, s, f, p, c in zip(
-                columns["id"], columns["scene"], frames, columns["split"], columns["category"], strict=True
-            )
-        ]
 
     def __len__(self) -> int:
         return len(self.records)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None}
-
-    @property
-    def _open(self) -> h5py.File:
-        if self._file is None:
-            self._file = h5py.File(self.path, "r")
-        return self._file
 
     def read(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         """Read pairs at training size.
@@ -168,7 +200,8 @@ class DepthStore:
         """
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
-        source_image, source_depth = self._open["image"], self._open["depth_mm"]
+        file = self._handle.get(self.path)
+        source_image, source_depth = file["image"], file["depth_mm"]
         for row, index in enumerate(indices):
             source_image.read_direct(images, np.s_[index], np.s_[row])
             source_depth.read_direct(depths, np.s_[index], np.s_[row])
@@ -185,9 +218,10 @@ class DepthStore:
                 f"'{self.path}' holds no native-resolution truth, which this protocol scores against. "
                 "Pass data.native=true, or protocol=paper."
             )
-        ends = self._open["native/end"]
+        file = self._handle.get(self.path)
+        ends = file["native/end"]
         start = int(ends[index - 1]) if index else 0
-        mm = cv2.imdecode(self._open["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
+        mm = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
         if mm is None:
             raise DataError(
                 f"'{self.path}': the truth of '{self.records[index].id}' is damaged. Delete it and prepare again."

@@ -106,10 +106,10 @@ def load_trunk_weights(trunk: ResNet18Trunk, weights: str) -> None:
     missing = sorted(own.keys() - state.keys())
     unknown = sorted(state.keys() - own.keys())
     misshapen = sorted(name for name in own.keys() & state.keys() if own[name].shape != state[name].shape)
-    for problem, names in (("lacks", missing), ("has unknown", unknown), ("has misshapen", misshapen)):
+    for problem, names in (("missing", missing), ("unknown", unknown), ("of another shape", misshapen)):
         if names:
             raise CheckpointError(
-                f"model.weights: '{weights}' {problem} {len(names)} tensors, the first is '{names[0]}'. "
+                f"model.weights: '{weights}' does not fit: {len(names)} tensors {problem}, the first is '{names[0]}'. "
                 "Pass a ResNet-18 file with torchvision's parameter names, or model.weights=none."
             )
     trunk.load_state_dict(state)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -29,6 +32,17 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     return {str(key): value for key, value in config.items()}
+
+
+@contextmanager
+def without_known_warnings() -> Iterator[None]:
+    """Hide warnings of the libraries that no user can act upon."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*does not have many workers.*")  # reading a store needs none
+        warnings.filterwarnings("ignore", ".*exists and is not empty.*")  # the run directory, by design
+        warnings.filterwarnings("ignore", ".*LeafSpec.*")  # between Lightning and torch
+        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # its greetings
+        yield
 
 
 def build_data(data: Mapping[str, Any], *, trust: list[str]) -> DepthDataModule:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import logging
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from hudepth.errors import ConfigError, DataError, did_you_mean
 from hudepth.evaluation import Evaluation, trivial_baselines
 from hudepth.files import write_json, write_text
 from hudepth.metrics.protocol import Protocol
-from hudepth.tasks.common import build_data, build_protocols, plain
+from hudepth.tasks.common import build_data, build_protocols, plain, without_known_warnings
 from hudepth.viz.panels import save_panels
 
 SHOWN = ("abs_rel", "sq_rel", "rmse", "rmse_log", "log10", "silog", "mae", "ssim", "delta1", "delta2", "delta3")
@@ -105,9 +103,8 @@ def score_checkpoint(
     if config.get("baselines", True):
         predictors |= trivial_baselines(store, split.train, max_depth_m=datamodule.max_depth_m)
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m)
-    trainer = _trainer(config["trainer"])
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    with without_known_warnings():
+        trainer = _trainer(config["trainer"])
         trainer.test(evaluation, datamodule=datamodule, verbose=False)
     results = {}
     indices = evaluation.indices()
@@ -137,7 +134,6 @@ def score_checkpoint(
 
 
 def _trainer(options: dict[str, Any]) -> Trainer:
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     used = {key: options[key] for key in ("accelerator", "precision") if key in options}
     return Trainer(
         **used,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import traceback
-import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +32,7 @@ from hudepth.data.splits import load_split, save_split
 from hudepth.errors import CheckpointError, ConfigError, HudepthError
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
-from hudepth.tasks.common import build_data, build_protocols, plain
+from hudepth.tasks.common import build_data, build_protocols, plain, without_known_warnings
 from hudepth.tasks.test import score_checkpoint
 
 RUN_ENV = "HUDEPTH_RUN"
@@ -160,7 +158,8 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         save_split(split_file, datamodule.split, datamodule.store.records)
     module = build_module(config, datamodule, trust=trust)
     callbacks = _callbacks(config, path, datamodule)
-    trainer = _trainer(config, path, callbacks)
+    with without_known_warnings():
+        trainer = _trainer(config, path, callbacks)
     log.info(
         "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d, %s, %d threads",
         type(module.net).__name__, f"{sum(p.numel() for p in module.net.parameters()):,}", datamodule.source.name,
@@ -168,10 +167,7 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         datamodule.batch_size, trainer.accelerator.__class__.__name__.removesuffix("Accelerator"), _threads(),
     )  # fmt: skip
     last = path / run_dir.CHECKPOINTS / run_dir.LAST
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*does not have many workers.*")
-        warnings.filterwarnings("ignore", ".*exists and is not empty.*")
-        warnings.filterwarnings("ignore", ".*LeafSpec.*")
+    with without_known_warnings():
         trainer.fit(module, datamodule=datamodule, ckpt_path=last if resume else None, weights_only=True)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
     score = best.best_model_score
@@ -232,7 +228,6 @@ def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> T
     loggers: list[Logger] = [instantiate(extra, trust=config["trust"]) for extra in options["extra"]]
     if options["tensorboard"]:
         loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # its greetings; warnings still come through
     try:
         return Trainer(
             **config["trainer"],

@@ -189,8 +189,19 @@ def assert_equal(a: Any, b: Any) -> None:
 
 
 def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(tmp_path: Path, cache: Path) -> None:
-    options = [*TINY, "test=false", "schedule=cosine", "callbacks.panels=0", "logger=none", "trainer.max_epochs=100", "seed=7"]
-    assert subprocess.run(**script("train", *options, "name=whole", cwd=tmp_path, cache=cache), check=False).returncode == 0
+    options = [
+        *TINY,
+        "test=false",
+        "schedule=cosine",
+        "callbacks.panels=0",
+        "logger=none",
+        "trainer.max_epochs=100",
+        "seed=7",
+    ]
+    assert (
+        subprocess.run(**script("train", *options, "name=whole", cwd=tmp_path, cache=cache), check=False).returncode
+        == 0
+    )
     reference = only_run(tmp_path, "whole")
 
     chance = random.Random(0)

@@ -155,7 +155,7 @@ def kinect_holes(depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.ran
 
 def _whole(name: str, value: object, *, at_least: int) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < at_least:
-        raise ConfigError(f"data.{name}: got {value!r}. Pass a whole number of at least {at_least}.")
+        raise ConfigError(f"data.source.{name}: got {value!r}. Pass a whole number of at least {at_least}.")
     return value
 
 

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from hudepth import cli
+
+CONF = cli.conf_folder()
+FILES = sorted(CONF.rglob("*.yaml"))
+SMALL = (
+    "data.size=[32,48]", "data.source.scenes=6", "data.source.frames_per_scene=2", "data.source.size=[48,64]",
+    "data.batch_size=2", "callbacks.panels=1", "trainer.accelerator=cpu", "trainer.max_epochs=1",
+)  # fmt: skip
+
+
+def names(group: str) -> list[str]:
+    return [path.stem for path in FILES if path.parent.name == group]
+
+
+def composed(*overrides: str, task: str = "train") -> dict[str, object]:
+    GlobalHydra.instance().clear()
+    with initialize_config_module("hudepth.conf", version_base="1.3"):
+        config = OmegaConf.to_container(compose(task, overrides=list(overrides)), resolve=True)
+    assert isinstance(config, dict)
+    return {str(key): value for key, value in config.items()}
+
+
+@pytest.mark.parametrize(
+    "group", ["data", "model", "loss", "optim", "schedule", "trainer", "callbacks", "logger", "protocol"]
+)
+def test_every_choice_of_every_group_composes(group: str) -> None:
+    for name in set(names(group)) - {"base"}:
+        assert composed(f"{group}={name}")[group]
+
+
+@pytest.mark.parametrize("choice", [f"{group}={name}" for group in ("experiment", "debug") for name in names(group)])
+def test_every_experiment_changes_something_and_runs_a_step(
+    choice: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    added = choice if choice.startswith("debug") else f"+{choice}"
+    assert composed(added) != composed()
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HUDEPTH_CACHE", str(tmp_path_factory.getbasetemp() / "conf_cache"))
+    steps = ["+trainer.max_steps=1", "trainer.limit_val_batches=1"]
+    weights = ["model.weights=none"] if choice == "experiment=badcl" else []
+    sys_argv = ["hudepth-train", choice, *SMALL, *steps, *weights]
+    monkeypatch.setattr(sys, "argv", sys_argv)
+    assert cli.train() == 0
+    assert list(tmp_path.glob("runs/*/*/status.json"))
+
+
+@pytest.mark.parametrize("name", names("sweep"))
+def test_every_sweep_is_a_multirun_whose_jobs_compose(name: str) -> None:
+    text = yaml.safe_load((CONF / "sweep" / f"{name}.yaml").read_text())
+    params = text["hydra"]["sweeper"]["params"]
+    assert text["hydra"]["mode"] == "MULTIRUN"
+    for key, values in params.items():
+        for value in str(values).split(","):
+            assert composed(f"{key}={value}")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))
+def test_every_file_opens_with_a_comment_and_experiments_with_their_command(path: Path) -> None:
+    text = path.read_text()
+    assert text.startswith("#")
+    if path.parent.name in ("experiment", "sweep", "debug"):
+        assert text.startswith("# @package _global_\n")
+        command = re.search(r"^#   hudepth-train (.*)$", text, re.MULTILINE)
+        assert command, "says the command that runs it"
+        assert f"{path.parent.name}={path.stem}" in command[1]
+
+
+@pytest.mark.parametrize("task", ["train", "test", "data"])
+def test_every_task_composes(task: str) -> None:
+    GlobalHydra.instance().clear()
+    with initialize_config_module("hudepth.conf", version_base="1.3"):
+        assert compose(task)

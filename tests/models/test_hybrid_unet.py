@@ -1,0 +1,291 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from hudepth.errors import ConfigError
+from hudepth.models import HybridUNet
+
+# Every row of table A1 with a shape: (module here, output without the batch, parameters or None where it states none).
+TABLE_A1 = [
+    ("", (1, 224, 224), None),
+    ("trunk.conv1", (64, 112, 112), 9_408),
+    ("trunk.bn1", (64, 112, 112), 128),
+    ("trunk.relu", (64, 112, 112), None),
+    ("trunk.maxpool", (64, 56, 56), None),
+    ("trunk.layer1", (64, 56, 56), None),
+    ("trunk.layer1.0", (64, 56, 56), 73_984),
+    ("trunk.layer1.1", (64, 56, 56), 73_984),
+    ("trunk.layer2", (128, 28, 28), None),
+    ("trunk.layer2.0", (128, 28, 28), 230_144),
+    ("trunk.layer2.1", (128, 28, 28), 295_424),
+    ("trunk.layer3", (256, 14, 14), None),
+    ("trunk.layer3.0", (256, 14, 14), 919_040),
+    ("trunk.layer3.1", (256, 14, 14), 1_180_672),
+    ("attention_skip", (128, 28, 28), None),
+    ("attention_skip.attention", (784, 128), 66_048),
+    ("attention_skip.norm1", (784, 128), 256),
+    ("attention_skip.feed_forward", (784, 128), 131_712),
+    ("attention_skip.norm2", (784, 128), 256),
+    ("attention_deepest", (256, 14, 14), None),
+    ("attention_deepest.attention", (196, 256), 263_168),
+    ("attention_deepest.norm1", (196, 256), 512),
+    ("attention_deepest.feed_forward", (196, 256), 525_568),
+    ("attention_deepest.norm2", (196, 256), 512),
+    ("up1", (128, 28, 28), None),
+    ("up1.conv1", (128, 28, 28), 442_496),
+    ("up1.bn1", (128, 28, 28), 256),
+    ("up1.conv2", (128, 28, 28), 147_584),
+    ("up1.bn2", (128, 28, 28), 256),
+    ("up2", (64, 56, 56), None),
+    ("up2.conv1", (64, 56, 56), 110_656),
+    ("up2.bn1", (64, 56, 56), 128),
+    ("up2.conv2", (64, 56, 56), 36_928),
+    ("up2.bn2", (64, 56, 56), 128),
+    ("up3", (64, 112, 112), None),
+    ("up3.conv1", (64, 112, 112), 73_792),
+    ("up3.bn1", (64, 112, 112), 128),
+    ("up3.conv2", (64, 112, 112), 36_928),
+    ("up3.bn2", (64, 112, 112), 128),
+    ("head_up", (32, 224, 224), 32_800),
+    ("head", (1, 224, 224), 289),
+]
+TOTAL = 4_653_313
+SKIP_BLOCK = 66_048 + 256 + 131_712 + 256
+DEEPEST_BLOCK = 263_168 + 512 + 525_568 + 512
+
+
+def count(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.fixture(scope="module")
+def net() -> HybridUNet:
+    torch.manual_seed(0)
+    return HybridUNet()
+
+
+@pytest.fixture(scope="module")
+def shapes(net: HybridUNet) -> dict[str, list[tuple[int, ...]]]:
+    """Shapes that each module of the network returned in one forward pass of two images."""
+    seen: dict[str, list[tuple[int, ...]]] = {}
+
+    def note(name: str):  # type: ignore[no-untyped-def]
+        def hook(module: nn.Module, inputs: tuple[Tensor, ...], output: object) -> None:
+            first = output[0] if isinstance(output, tuple) else output
+            if isinstance(first, Tensor):
+                seen.setdefault(name, []).append(tuple(first.shape))
+
+        return hook
+
+    handles = [module.register_forward_hook(note(name)) for name, module in net.named_modules()]
+    net.train()  # in eval mode PyTorch's fused attention would pass hooks of its parts by
+    net(torch.randn(2, 3, 224, 224))
+    for handle in handles:
+        handle.remove()
+    return seen
+
+
+@pytest.mark.parametrize(("name", "shape", "parameters"), TABLE_A1, ids=[row[0] or "network" for row in TABLE_A1])
+def test_row_of_table_a1(
+    net: HybridUNet,
+    shapes: dict[str, list[tuple[int, ...]]],
+    name: str,
+    shape: tuple[int, ...],
+    parameters: int | None,
+) -> None:
+    assert shapes[name] == [(2, *shape)] * len(shapes[name])
+    if parameters is not None:
+        assert count(net.get_submodule(name)) == parameters
+
+
+def test_the_rows_of_table_a1_are_all_there_is(net: HybridUNet) -> None:
+    assert sum(row[2] or 0 for row in TABLE_A1) == TOTAL
+    assert count(net) == TOTAL
+    assert all(parameter.requires_grad for parameter in net.parameters())
+
+
+@pytest.mark.parametrize(
+    ("attention", "missing"),
+    [
+        ("both", 0),
+        ("deepest", SKIP_BLOCK),
+        ("skip", DEEPEST_BLOCK),
+        ("none", SKIP_BLOCK + DEEPEST_BLOCK),
+    ],
+)
+def test_attention_option_leaves_out_whole_blocks(attention: str, missing: int) -> None:
+    net = HybridUNet(attention=attention).eval()
+    assert count(net) == TOTAL - missing
+    assert net(torch.randn(1, 3, 32, 32)).shape == (1, 1, 32, 32)
+
+
+@pytest.mark.parametrize("heads", [1, 2, 8, 128])
+def test_heads_change_the_function_but_not_its_size(heads: int) -> None:
+    net = HybridUNet(attention_heads=heads)
+    assert count(net) == TOTAL
+    assert net.attention_skip.attention.num_heads == heads  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("upsample", ["nearest", "bilinear"])
+def test_upsample_option_reaches_all_up_blocks(upsample: str) -> None:
+    net = HybridUNet(upsample=upsample)  # type: ignore[arg-type]
+    assert [up.upsample for up in (net.up1, net.up2, net.up3)] == [upsample] * 3
+    assert count(net) == TOTAL
+
+
+def test_options_change_the_output() -> None:
+    image = torch.randn(1, 3, 64, 64)
+    outputs = []
+    for options in ({}, {"attention_heads": 4}, {"attention_activation": "gelu"}, {"upsample": "bilinear"}):
+        torch.manual_seed(0)
+        outputs.append(HybridUNet(**options).eval()(image))  # type: ignore[arg-type]
+    assert all(not torch.equal(a, b) for i, a in enumerate(outputs) for b in outputs[:i])
+
+
+@pytest.mark.parametrize(
+    ("output", "low", "high"), [("sigmoid", 0.0, 1.0), ("relu", 0.0, None), ("softplus", 0.0, None)]
+)
+def test_output_range(output: str, low: float, high: float | None) -> None:
+    net = HybridUNet(attention="none", output=output).eval()
+    nn.init.normal_(net.head.weight, std=10)
+    unit_depth = net(torch.randn(1, 3, 32, 32))
+    assert unit_depth.min() >= low
+    assert unit_depth.unique().numel() > 10
+    if high is not None:
+        assert unit_depth.max() <= high
+    else:
+        assert unit_depth.max() > 1
+
+
+def test_identity_output_is_what_the_others_are_made_of() -> None:
+    image = torch.randn(1, 3, 32, 32)
+    made = {}
+    for output in ("identity", "sigmoid", "relu", "softplus"):
+        torch.manual_seed(0)
+        net = HybridUNet(attention="none", output=output).eval()
+        nn.init.normal_(net.head.weight)  # so that both signs come up
+        made[output] = net(image)
+    raw = made["identity"]
+    assert raw.min() < 0 < raw.max()
+    torch.testing.assert_close(made["sigmoid"], 1 / (1 + (-raw).exp()))
+    torch.testing.assert_close(made["relu"], raw.clamp(min=0))
+    torch.testing.assert_close(made["softplus"], (1 + raw.exp()).log())
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "nearest"),
+    [
+        (225, 224, "[224,224] or [240,224]"),
+        (224, 300, "[224,288] or [224,304]"),
+        (17, 31, "[16,16] or [32,32]"),
+        (8, 64, "[16,64]"),
+        (1, 1, "[16,16]"),
+    ],
+)
+def test_size_that_does_not_fit_names_the_nearest(net: HybridUNet, height: int, width: int, nearest: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        net(torch.zeros(1, 3, height, width))
+    assert str(caught.value) == (
+        f"data.size: images of {height} x {width} (height x width), but both sides must be multiples of 16. "
+        f"Pass data.size={nearest}."
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"attention": "deep"},
+            "model.attention: no 'deep'. Did you mean 'deepest'? Pass one of none, skip, deepest, both.",
+        ),
+        ({"attention": "x"}, "model.attention: no 'x'. Pass one of none, skip, deepest, both."),
+        (
+            {"attention_heads": 7},
+            "model.attention_heads: 7 heads do not divide 128 channels. Pass one of [1, 2, 4, 8, 16, 32, 64].",
+        ),
+        (
+            {"attention_heads": 0},
+            "model.attention_heads: 0 heads do not divide 128 channels. Pass one of [1, 2, 4, 8, 16, 32, 64].",
+        ),
+        (
+            {"attention_activation": "gelo"},
+            "model.attention_activation: no 'gelo'. Did you mean 'gelu'? Pass one of relu, gelu, silu.",
+        ),
+        (
+            {"output": "sigmoidal"},
+            "model.output: no 'sigmoidal'. Did you mean 'sigmoid'? Pass one of sigmoid, relu, softplus, identity.",
+        ),
+    ],
+)
+def test_unknown_option(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        HybridUNet(**options)  # type: ignore[arg-type]
+    assert str(caught.value) == message
+
+
+def test_unknown_upsample() -> None:
+    bare = HybridUNet.__init__
+    while hasattr(bare, "__wrapped__"):  # the checker of the tests would refuse the type before the constructor does
+        bare = bare.__wrapped__
+    with pytest.raises(ConfigError) as caught:
+        bare(HybridUNet.__new__(HybridUNet), upsample="bilinar")  # type: ignore[arg-type]
+    assert str(caught.value) == (
+        "model.upsample: no 'bilinar'. Did you mean 'bilinear'? Pass one of nearest, bilinear."
+    )
+
+
+def test_gradient_reaches_every_parameter() -> None:
+    torch.manual_seed(0)
+    net = HybridUNet().train()
+    # A mean over squares: batch norms and layer norms pass no gradient of a plain sum of their outputs.
+    net(torch.randn(2, 3, 64, 64)).square().mean().backward()
+    unreached = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert unreached == []
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
+
+
+@pytest.mark.parametrize("size", [(32, 64), (96, 48), (16, 16)])
+def test_any_size_that_is_a_multiple_of_16(net: HybridUNet, size: tuple[int, int]) -> None:
+    net.eval()
+    assert net(torch.randn(1, 3, *size)).shape == (1, 1, *size)
+
+
+def test_images_of_a_batch_do_not_see_each_other(net: HybridUNet) -> None:
+    net.eval()
+    images = torch.randn(3, 3, 64, 48)
+    with torch.inference_mode():
+        together = net(images)
+        alone = torch.cat([net(image[None]) for image in images])
+    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-6)
+
+
+def test_every_pixel_sees_the_whole_image(net: HybridUNet) -> None:
+    """What attention adds: without it a far corner is out of reach of the first pixel's receptive field."""
+    net.eval()
+    image = torch.randn(1, 3, 512, 16)
+    other = image.clone()
+    other[..., -16:, :] += 3
+    plain = HybridUNet(attention="none").eval()
+    with torch.inference_mode():
+        assert not torch.equal(net(image)[..., 0, 0], net(other)[..., 0, 0])
+        assert torch.equal(plain(image)[..., 0, 0], plain(other)[..., 0, 0])
+
+
+def test_training_and_evaluation_attention_paths_agree(net: HybridUNet) -> None:
+    x = torch.randn(2, 256, 4, 6)
+    block = net.attention_deepest
+    with torch.inference_mode():
+        fused = block.eval()(x)  # PyTorch takes its fused path
+    torch.testing.assert_close(block.train()(x), fused.clone(), rtol=1e-4, atol=1e-5)
+
+
+def test_nothing_but_the_table_is_saved(net: HybridUNet, tmp_path: Path) -> None:
+    torch.save(net.state_dict(), tmp_path / "net.pt")
+    again = HybridUNet()
+    again.load_state_dict(torch.load(tmp_path / "net.pt", weights_only=True), strict=True)
+    image = torch.randn(1, 3, 32, 32)
+    assert torch.equal(again.eval()(image), net.eval()(image))

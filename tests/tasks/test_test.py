@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hudepth.checkpoint import KEY, read_plain
+
+from .conftest import TINY, Command
+
+
+def metrics(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the trained run, for tests that write to it."""
+    copy = tmp_path / "runs" / "tiny" / trained.name
+    shutil.copytree(trained, copy)
+    return copy
+
+
+@pytest.mark.parametrize("spec", ["file", "run", "last"])
+def test_a_checkpoint_needs_nothing_else(spec: str, command: Command, run: Path, trained: Path) -> None:
+    shutil.rmtree(run / "test")
+    checkpoint = {"file": run / "checkpoints" / "best.ckpt", "run": run, "last": "last"}[spec]
+    done = command("test", f"checkpoint={checkpoint}")
+    assert done.code == 0, done.err
+    for protocol in ("paper", "eigen"):
+        assert metrics(run / "test" / protocol) == metrics(trained / "test" / protocol)  # what training printed
+        assert (run / "test" / protocol / "panels.png").stat().st_size > 10_000
+    assert "mean depth map" in done.out
+    assert "eigen protocol, 2 test images of rooms" in done.out
+
+
+def test_the_metric_file_states_its_protocol(trained: Path) -> None:
+    stated = metrics(trained / "test" / "eigen")
+    assert stated["protocol"]["crop"] == [45, 471, 41, 601]
+    assert stated["protocol"]["clamp_m"] == [1e-3, 10.0]
+    assert stated["protocol"]["valid"] == "measured, 0.001 m < truth < 10 m"
+    assert stated["protocol"]["averaging"] == "image"
+    assert stated["protocol"]["ssim"]["window"] == 11
+    assert stated["protocol"]["units"]["rmse"] == "m"
+    assert stated["split"]["kind"] == "official"
+    assert len(stated["split"]["sha256"]) == len(stated["data"]["fingerprint"]) == 64
+    assert stated["network_size"] == [32, 48]
+    assert stated["images"] == 2
+
+
+def test_the_table_is_the_mean_of_the_images(trained: Path) -> None:
+    with (trained / "test" / "eigen" / "per_image.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    table = metrics(trained / "test" / "eigen")["metrics"]["model"]
+    assert [row["scene"] for row in rows] == ["room_0005"] * 2
+    for name, value in table.items():
+        assert np.mean([float(row[name]) for row in rows]) == pytest.approx(value, rel=1e-5)
+
+
+def test_one_protocol_and_an_output_folder(command: Command, trained: Path, tmp_path: Path) -> None:
+    done = command("test", f"checkpoint={trained}", "protocol=paper", "output=scores", "baselines=false", "panels=0")
+    assert done.code == 0, done.err
+    assert [path.name for path in (tmp_path / "scores").iterdir()] == ["paper"]
+    assert list(metrics(tmp_path / "scores" / "paper")["metrics"]) == ["model"]
+
+
+def test_a_moved_file_is_tested_on_its_own_split(command: Command, trained: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved.ckpt"
+    shutil.copy(trained / "checkpoints" / "best.ckpt", moved)
+    assert command("test", f"checkpoint={moved}").code == 0
+    assert metrics(tmp_path / "test_moved" / "eigen") == {
+        **metrics(trained / "test" / "eigen"),
+        "checkpoint": {**metrics(trained / "test" / "eigen")["checkpoint"], "file": "moved.ckpt"},
+    }
+
+
+def test_other_data(command: Command, run: Path) -> None:
+    done = command(
+        "test", f"checkpoint={run}", "data=rooms", *(a for a in TINY if a.startswith("data")), "data.source.seed=5"
+    )
+    assert done.code == 0, done.err
+    ours, other = metrics(run / "test" / "paper"), metrics(run / "test_rooms" / "paper")
+    assert ours["data"]["fingerprint"] != other["data"]["fingerprint"]
+    assert ours["metrics"]["model"] != other["metrics"]["model"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["data.rooot=x"], "data.rooot: the checkpoint's data has no such key."),
+        (["data.source.scenes=7"], "the split of rooms is not the one it was trained on, so test pairs may have been trained on."),
+        (["protocol=eigne"], "protocol: no 'eigne'. Did you mean 'eigen'? Pass one of eigen, paper."),
+    ],
+)  # fmt: skip
+def test_mistakes(arguments: list[str], message: str, command: Command, trained: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved.ckpt"
+    shutil.copy(trained / "checkpoints" / "best.ckpt", moved)
+    done = command("test", f"checkpoint={moved}", *arguments)
+    assert done.code == 1
+    assert message in done.err.splitlines()[-1]
+    assert "Traceback" not in done.err
+
+
+def test_a_checkpoint_with_code_is_refused_and_not_run(command: Command, tmp_path: Path) -> None:
+    marker = tmp_path / "ran"
+
+    class Evil:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return Path.touch, (marker,)
+
+    torch.save({"state_dict": {}, KEY: Evil()}, tmp_path / "evil.ckpt")
+    done = command("test", "checkpoint=evil.ckpt")
+    assert done.code == 1
+    assert "'evil.ckpt' is refused: it holds more than tensors and plain values" in done.err
+    assert not marker.exists()
+
+
+def test_a_checkpoint_whose_configuration_names_code_is_refused(
+    command: Command, trained: Path, tmp_path: Path
+) -> None:
+    content = read_plain(trained / "checkpoints" / "best.ckpt")
+    content[KEY]["config"]["model"] = {"_target_": "os.system", "command": f"touch {tmp_path / 'ran'}"}
+    torch.save(content, tmp_path / "evil.ckpt")
+    done = command("test", "checkpoint=evil.ckpt")
+    assert done.code == 1
+    assert "_target_: 'os.system' is not under a trusted module" in done.err
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_checkpoint_of_another_model_is_refused(command: Command, trained: Path, tmp_path: Path) -> None:
+    content = read_plain(trained / "checkpoints" / "best.ckpt")
+    content[KEY]["config"]["model"]["channels"] = 16
+    torch.save(content, tmp_path / "other.ckpt")
+    done = command("test", "checkpoint=other.ckpt")
+    assert done.code == 1
+    assert "'other.ckpt' is from another model: " in done.err.splitlines()[-1]
