@@ -49,7 +49,7 @@ def test_every_experiment_changes_something_and_runs_a_step(
     GlobalHydra.instance().clear()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HUDEPTH_CACHE", str(tmp_path_factory.getbasetemp() / "conf_cache"))
-    steps = ["+trainer.max_steps=1", "trainer.limit_val_batches=1"]
+    steps = ["trainer.limit_train_batches=1", "trainer.limit_val_batches=1"]
     weights = ["model.weights=none"] if choice == "experiment=badcl" else []
     sys_argv = ["hudepth-train", choice, *SMALL, *steps, *weights]
     monkeypatch.setattr(sys, "argv", sys_argv)

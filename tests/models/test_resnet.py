@@ -15,7 +15,7 @@ from torch.nn import functional
 from hudepth.errors import CheckpointError
 from hudepth.models.resnet import IMAGENET_URL, BasicBlock, ResNet18Trunk
 
-TORCHVISION = "Pass a ResNet-18 file with torchvision's parameter names"
+RESNET = "Pass a ResNet-18 file with torchvision's parameter names"
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_missing_tensors(tmp_path: Path, state: dict[str, Tensor]) -> None:
     with pytest.raises(CheckpointError) as caught:
         ResNet18Trunk(weights=path)
     assert str(caught.value) == (
-        f"model.weights: '{path}' does not fit: 12 tensors missing, the first is 'layer3.1.bn1.bias'. {TORCHVISION}, "
+        f"model.weights: '{path}' does not fit: 12 tensors missing, the first is 'layer3.1.bn1.bias'. {RESNET}, "
         "or model.weights=none."
     )
 
@@ -131,7 +131,7 @@ def test_unknown_tensors(tmp_path: Path, state: dict[str, Tensor]) -> None:
     with pytest.raises(CheckpointError) as caught:
         ResNet18Trunk(weights=path)
     assert str(caught.value) == (
-        f"model.weights: '{path}' does not fit: 1 tensors unknown, the first is 'layer3.2.conv1.weight'. {TORCHVISION}, "
+        f"model.weights: '{path}' does not fit: 1 tensors unknown, the first is 'layer3.2.conv1.weight'. {RESNET}, "
         "or model.weights=none."
     )
 
@@ -141,7 +141,7 @@ def test_misshapen_tensors_leave_the_trunk_as_it_was(tmp_path: Path, state: dict
     with pytest.raises(CheckpointError) as caught:
         ResNet18Trunk(weights=path)
     assert str(caught.value) == (
-        f"model.weights: '{path}' does not fit: 1 tensors of another shape, the first is 'conv1.weight'. {TORCHVISION}, "
+        f"model.weights: '{path}' does not fit: 1 tensors of another shape, the first is 'conv1.weight'. {RESNET}, "
         "or model.weights=none."
     )
 
@@ -190,7 +190,7 @@ def test_file_without_a_state_dict(tmp_path: Path, content: object) -> None:
     path = saved(tmp_path, content)
     with pytest.raises(CheckpointError) as caught:
         ResNet18Trunk(weights=path)
-    assert str(caught.value) == f"model.weights: '{path}' holds no state_dict. {TORCHVISION}."
+    assert str(caught.value) == f"model.weights: '{path}' holds no state_dict. {RESNET}."
 
 
 def test_damaged_file(tmp_path: Path) -> None:

@@ -1,0 +1,290 @@
+"""The depth store: what goes in comes out, and what is no store is refused."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import pickle
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hudepth.data.sources.base import Record
+from hudepth.data.store import DepthStore, StoreWriter, to_mm
+from hudepth.errors import DataError
+
+SIZE = (3, 5)
+
+
+def png(depth_mm: np.ndarray) -> np.ndarray:
+    return cv2.imencode(".png", depth_mm)[1].ravel()
+
+
+def write_store(
+    path: Path,
+    images: np.ndarray,
+    depths_mm: np.ndarray,
+    natives_mm: list[np.ndarray] | None = None,
+    records: list[Record] | None = None,
+) -> DepthStore:
+    writer = StoreWriter(path, size=images.shape[1:3], native=natives_mm is not None)
+    for i in range(len(images)):
+        record = records[i] if records else Record(id=f"{i:02d}", scene="kitchen", frame=i)
+        writer.append(record, images[i], depths_mm[i], None if natives_mm is None else png(natives_mm[i]))
+    writer.close({"source": "test"})
+    return DepthStore(path)
+
+
+@pytest.fixture
+def filled(tmp_path: Path) -> tuple[DepthStore, np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Seven pairs whose native truths all differ in size."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (7, *SIZE, 3), np.uint8)
+    depths = rng.integers(0, 65536, (7, *SIZE), np.uint16)
+    natives = [rng.integers(0, 65536, (4 + i, 9 - i), np.uint16) for i in range(7)]
+    return write_store(tmp_path / "a.h5", images, depths, natives), images, depths, natives
+
+
+@st.composite
+def contents(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    n, height, width = draw(st.integers(1, 4)), draw(st.integers(1, 6)), draw(st.integers(1, 6))
+    sizes = st.tuples(st.integers(1, 6), st.integers(1, 6))
+    return (
+        draw(arrays(np.uint8, (n, height, width, 3))),
+        draw(arrays(np.uint16, (n, height, width))),
+        [draw(arrays(np.uint16, draw(sizes))) for _ in range(n)],
+    )
+
+
+@given(content=contents())
+@settings(max_examples=20)
+def test_pixels_come_back_exactly(content: tuple[np.ndarray, np.ndarray, list[np.ndarray]]) -> None:
+    images, depths, natives = content
+    with tempfile.TemporaryDirectory() as folder:
+        store = write_store(Path(folder) / "a.h5", images, depths, natives)
+        image, depth = store.read(range(len(images)))
+        np.testing.assert_array_equal(image, images)
+        np.testing.assert_array_equal(depth, depths)
+        for i, native in enumerate(natives):
+            found = store.read_native(i)
+            assert found.dtype == np.float32
+            np.testing.assert_array_equal(found, (native.astype(np.float64) / 1000).astype(np.float32))
+
+
+def test_records_and_info_come_back(tmp_path: Path) -> None:
+    records = [
+        Record(id="küche_0004/17", scene="küche_0004", frame=17, split="train", category="küche"),
+        Record(id="b", scene="", frame=0),
+    ]
+    images, depths = np.zeros((2, *SIZE, 3), np.uint8), np.ones((2, *SIZE), np.uint16)
+    store = write_store(tmp_path / "a.h5", images, depths, records=records)
+    assert store.records == records
+    assert (len(store), store.size, store.info, store.has_native) == (2, SIZE, {"source": "test"}, False)
+
+
+def test_it_grows_beyond_the_first_allocation(tmp_path: Path) -> None:
+    depths = np.arange(130, dtype=np.uint16)[:, None, None] + np.ones((1, 1, 1), np.uint16)
+    store = write_store(tmp_path / "a.h5", np.zeros((130, 1, 1, 3), np.uint8), depths)
+    assert len(store) == 130
+    np.testing.assert_array_equal(store.read(range(130))[1], depths)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["image"].shape == (130, 1, 1, 3)
+
+
+@given(indices=st.lists(st.integers(0, 6), max_size=12))
+def test_any_order_and_repetition(indices: list[int]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        rng = np.random.default_rng(1)
+        images, depths = rng.integers(0, 256, (7, *SIZE, 3), np.uint8), rng.integers(0, 65536, (7, *SIZE), np.uint16)
+        image, depth = write_store(Path(folder) / "a.h5", images, depths).read(indices)
+    np.testing.assert_array_equal(image, images[indices] if indices else np.empty((0, *SIZE, 3)))
+    np.testing.assert_array_equal(depth, depths[indices] if indices else np.empty((0, *SIZE)))
+
+
+def test_millimetres_survive_metres_exactly() -> None:
+    mm = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    np.testing.assert_array_equal(to_mm(mm.astype(np.float32) / np.float32(1000)), mm)
+
+
+@given(depth=st.floats(0, 100, width=32))
+def test_to_mm_rounds_to_the_nearest_millimetre(depth: float) -> None:
+    found = int(to_mm(np.full((1, 1), depth, np.float32))[0, 0])
+    exact = Fraction(depth) * 1000
+    if depth == 0:
+        assert found == 0
+    elif exact >= 65535:
+        assert found == 65535
+    elif exact < 1:
+        assert found == 1
+    else:  # the product is rounded once to float32, which moves ties by less than 1/256 mm
+        assert abs(found - exact) <= Fraction(1, 2) + Fraction(1, 256)
+
+
+@pytest.mark.parametrize("depth", [1e-45, 1e-6, 4.9e-4])
+def test_a_measured_depth_never_becomes_unmeasured(depth: float) -> None:
+    np.testing.assert_array_equal(to_mm(np.array([[depth, 0]], np.float32)), np.array([[1, 0]], np.uint16))
+
+
+@pytest.mark.parametrize("depth", [65.535, 65.536, 70.0, 1e6, 3e38])
+def test_beyond_65_metres_is_capped(depth: float) -> None:
+    assert to_mm(np.array([[depth]], np.float32))[0, 0] == 65535
+
+
+def test_a_pickled_store_leaves_its_handle_behind(filled: tuple[Any, ...]) -> None:
+    store, images, _, _ = filled
+    fresh = pickle.dumps(store)
+    store.read([0])  # opens the handle, which h5py refuses to pickle
+    assert len(pickle.dumps(store)) == len(fresh)
+    again = pickle.loads(pickle.dumps(store))
+    np.testing.assert_array_equal(again.read([3])[0][0], images[3])
+    assert again.records == store.records
+
+
+def _read_in_fork(store: DepthStore, queue: Any) -> None:
+    queue.put([store.read([i])[1].sum(dtype=np.int64) for i in range(len(store))])
+
+
+def test_a_fork_reads_beside_its_parent(filled: tuple[Any, ...]) -> None:
+    store, _, depths, _ = filled
+    store.read([0])
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    children = [context.Process(target=_read_in_fork, args=(store, queue)) for _ in range(2)]
+    for child in children:
+        child.start()
+    expected = [int(depth.sum(dtype=np.int64)) for depth in depths]
+    assert [queue.get(timeout=30) for _ in children] == [expected, expected]
+    for child in children:
+        child.join()
+    np.testing.assert_array_equal(store.read(range(7))[1], depths)
+
+
+def test_without_native_truth(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    store = write_store(path, np.zeros((1, *SIZE, 3), np.uint8), np.ones((1, *SIZE), np.uint16))
+    with pytest.raises(DataError) as caught:
+        store.read_native(0)
+    assert str(caught.value) == (
+        f"'{path}' holds no native-resolution truth, which this protocol scores against. "
+        "Pass data.native=true, or protocol=paper."
+    )
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_a_pair_brings_native_truth_as_its_store_does(tmp_path: Path, native: bool) -> None:
+    writer = StoreWriter(tmp_path / "a.h5", size=SIZE, native=native)
+    depth = np.ones(SIZE, np.uint16)
+    with pytest.raises(ValueError, match="'x': native truth must be given for each pair of a store or for none"):
+        writer.append(Record("x", "", 0), np.zeros((*SIZE, 3), np.uint8), depth, None if native else png(depth))
+    writer.abort()
+
+
+def test_damaged_native_truth_names_the_pair(filled: tuple[Any, ...]) -> None:
+    store = filled[0]
+    with h5py.File(store.path, "r+") as file:
+        start = int(file["native/end"][1])
+        file["native/png"][start : start + 8] = 0
+    with pytest.raises(DataError) as caught:
+        store.read_native(2)
+    assert str(caught.value) == f"'{store.path}': the truth of '02' is damaged. Delete it and prepare again."
+    store.read_native(3)
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"none\.h5' cannot be read as a depth store .*No such file.* prepare again\.$"):
+        DepthStore(tmp_path / "none.h5")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+def test_a_truncated_file(filled: tuple[Any, ...], share: float) -> None:
+    path = filled[0].path
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(DataError) as caught:
+        DepthStore(path)
+    message = str(caught.value)
+    assert message.startswith(f"'{path}' cannot be read as a depth store (")
+    assert message.endswith("). Delete it and prepare again.")
+    assert "\n" not in message
+
+
+def test_a_file_of_another_kind(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"PK\x03\x04 this is a zip" * 100)
+    with pytest.raises(DataError, match=r"a\.h5' cannot be read as a depth store \(.*signature not found.*\)"):
+        DepthStore(path)
+
+
+def test_a_foreign_hdf5_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["image"] = np.zeros((1, *SIZE, 3))
+    with pytest.raises(DataError) as caught:
+        DepthStore(path)
+    assert str(caught.value) == f"'{path}' is no depth store of version 1. Delete it and prepare again."
+
+
+def test_another_version(filled: tuple[Any, ...]) -> None:
+    path = filled[0].path
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = 2
+    with pytest.raises(DataError) as caught:
+        DepthStore(path)
+    assert str(caught.value) == f"'{path}' is no depth store of version 1. Delete it and prepare again."
+
+
+def test_an_unfinished_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    writer = StoreWriter(path, size=SIZE, native=False)
+    writer.append(Record("a", "", 0), np.zeros((*SIZE, 3), np.uint8), np.ones(SIZE, np.uint16), None)
+    writer.abort()
+    writer.abort()  # twice does no harm
+    with pytest.raises(DataError, match=r"Delete it and prepare again\.$"):
+        DepthStore(path)
+
+
+def _drop_frames(file: h5py.File) -> None:
+    del file["records/frame"]
+    file["records/frame"] = np.zeros(3, np.int64)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda file: file.attrs.__delitem__("info"),
+        lambda file: file.attrs.__setitem__("info", "{not json"),
+        lambda file: file.attrs.__setitem__("info", 7),
+        lambda file: file.__delitem__("records/scene"),
+        lambda file: file.__delitem__("image"),
+        _drop_frames,
+    ],
+    ids=["no info", "info is no JSON", "info is a number", "no scenes", "no images", "too few frames"],
+)
+def test_a_store_with_a_part_missing(filled: tuple[Any, ...], damage: Any) -> None:
+    path = filled[0].path
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(DataError) as caught:
+        DepthStore(path)
+    assert str(caught.value).startswith(f"'{path}' cannot be read as a depth store (")
+
+
+def test_layout_is_as_documented(filled: tuple[Any, ...]) -> None:
+    with h5py.File(filled[0].path) as file:
+        assert {key: (file[key].dtype, file[key].shape) for key in ("image", "depth_mm", "native/end")} == {
+            "image": (np.uint8, (7, *SIZE, 3)),
+            "depth_mm": (np.uint16, (7, *SIZE)),
+            "native/end": (np.int64, (7,)),
+        }
+        assert len(file["native/png"]) == file["native/end"][-1]
+        assert sorted(file["records"]) == ["category", "frame", "id", "scene", "split"]
+        assert json.loads(file.attrs["info"]) == {"source": "test"}

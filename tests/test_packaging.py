@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from a copy of the sources and unpacked as pip would."""
+    folder = tmp_path_factory.mktemp("wheel")
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, text=True, capture_output=True, check=False).stdout.split()
+    for name in listed or [str(p.relative_to(ROOT)) for p in ROOT.rglob("*") if ".venv" not in p.parts and p.is_file()]:
+        if name.startswith(("hudepth/", "conf/", "pyproject", "README", "LICENSE")) and (ROOT / name).is_file():
+            (folder / "src" / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "src" / name).write_bytes((ROOT / name).read_bytes())
+    build = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
+    subprocess.run([sys.executable, "-c", build], cwd=folder / "src", capture_output=True, check=True)
+    (wheel,) = (folder / "src").glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    return folder / "site"
+
+
+def test_the_wheel_holds_every_module_and_configuration(site: Path) -> None:
+    for folder, inside in ((ROOT / "hudepth", "hudepth"), (ROOT / "conf", "hudepth/conf")):
+        for path in folder.rglob("*"):
+            if path.suffix in (".py", ".yaml") or path.name == "py.typed":
+                assert (site / inside / path.relative_to(folder)).is_file(), path
+
+
+def test_the_wheel_runs_from_anywhere(site: Path, tmp_path: Path) -> None:
+    code = "import hudepth, sys; from hudepth import cli; assert sys.argv[1] in hudepth.__file__; sys.argv[1:] = ['experiment=badcl', '--cfg', 'job']; sys.exit(cli.train())"  # noqa: E501
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(site)],
+        cwd=tmp_path,
+        env=environment,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "max_epochs: 100" in done.stdout
+
+
+def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    tested = (ROOT / "constraints.txt").read_text()
+    extras = PROJECT["project"]["optional-dependencies"]["dev"]
+    for requirement in PROJECT["project"]["dependencies"]:
+        name = re.split(r"[><=]", requirement)[0]
+        assert ">=" in requirement
+        assert re.search(rf'^    "{re.escape(requirement)}",\s+# \S', text, re.MULTILINE), requirement
+        assert f"\n{name}==" in tested.lower(), name
+    for requirement in extras:
+        assert f"\n{re.split('[><=]', requirement)[0].lower()}==" in tested.lower(), requirement
+
+
+def imported(path: Path) -> set[str]:
+    """Return the top-level packages a file imports when it is imported."""
+    names = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add((node.module or "").partition(".")[0])
+    return names
+
+
+def test_hydra_stops_at_the_tasks() -> None:
+    for path in (ROOT / "hudepth").rglob("*.py"):
+        if path.parent.name != "tasks":
+            assert not imported(path) & {"hydra", "omegaconf"}, path
+
+
+def test_what_worker_processes_import_is_light(tmp_path: Path) -> None:
+    code = (
+        "import sys, hudepth.data.prepare, hudepth.data.sources.rooms, hudepth.data.sources.densedepth; "
+        "print({'torch', 'lightning', 'hydra', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, text=True, capture_output=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,121 @@
+"""Every block of the README is executed; figures in it must be those of the committed run."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+
+from hudepth import cli
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.DOTALL)
+COMMANDS = [line for language, block in BLOCKS if language == "bash" for line in block.strip().splitlines()]
+
+SMALL = [
+    "data.size=[32,48]", "trainer.max_epochs=1", "trainer.accelerator=cpu", "data.batch_size=2", "callbacks.panels=0",
+    "logger=none", "trainer.limit_train_batches=1", "trainer.limit_val_batches=1",
+]  # fmt: skip
+"""Appended to training commands: the same commands, in seconds."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that has what the README's commands name: nyu with index.csv, mine with images and depths."""
+    folder = tmp_path_factory.mktemp("readme")
+    rng = np.random.default_rng(0)
+    for kind in ("nyu", "mine/images", "mine/depths"):
+        (folder / kind).mkdir(parents=True)
+    rows = ["index,image,depth,scene,category,split,depth_scale_m,depth_offset"]
+    for i in range(20):
+        image, depth = rng.integers(0, 255, (48, 64, 3), np.uint8), rng.integers(100, 255, (48, 64), np.uint8)
+        cv2.imwrite(str(folder / f"nyu/{i:05d}.jpg"), image)
+        cv2.imwrite(str(folder / f"nyu/{i:05d}.png"), depth)
+        rows.append(f"{i},{i:05d}.jpg,{i:05d}.png,room_{i},room,{'train' if i < 12 else 'test'},0.01,0.5")
+        cv2.imwrite(str(folder / f"mine/images/{i}.png"), image)
+        cv2.imwrite(str(folder / f"mine/depths/{i}.png"), depth.astype(np.uint16) * 10)
+    (folder / "nyu/index.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def shortened(command: str) -> list[str]:
+    """Return the command with what makes it run in seconds and without a network."""
+    words = command.split()
+    if words[0] != "hudepth-train" or {"--help", "--cfg"} & set(words) or "resume=" in command:
+        return words
+    rooms = [] if "data=" in command else ["data.source.scenes=6", "data.source.size=[48,64]"]
+    weights = ["model.weights=none"] if "experiment=badcl" in command else []
+    return [w for w in words if not w.startswith("trainer.max_epochs")] + SMALL + rooms + weights
+
+
+def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("HUDEPTH_CACHE", str(folder / "cache"))
+    for command in COMMANDS:
+        words = shortened(command)
+        if words[0] == "source":
+            continue  # the tests run inside the environment
+        if words[0] == "make":
+            subprocess.run(["make", "--dry-run", "--directory", str(ROOT), *words[1:]], check=True, capture_output=True)
+            continue
+        if words[1].startswith("resume="):
+            (run,) = (folder / "runs" / "badcl").iterdir()
+            words = [words[0], f"resume={run}", "trainer.max_epochs=2"]
+        GlobalHydra.instance().clear()
+        monkeypatch.setattr(sys, "argv", words)
+        assert getattr(cli, words[0].removeprefix("hudepth-"))() == 0, command
+    jobs = list(folder.glob("sweeps/badcl/*/*/status.json"))
+    assert len(jobs) == 9
+    assert all(json.loads(job.read_text())["state"] == "finished" for job in jobs)
+
+
+def test_the_python_of_the_readme(folder: Path) -> None:
+    (code,) = [block for language, block in BLOCKS if language == "python"]
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, text=True, capture_output=True, check=True)
+    assert re.fullmatch(r"\{'boundary': [\d.]+, 'smoothness': [\d.]+, 'scaling': [\d.]+\}\n", done.stdout)
+
+
+def test_all_blocks_are_of_a_kind_that_is_tested() -> None:
+    assert {language for language, _ in BLOCKS} == {"bash", "python"}
+
+
+def test_links_lead_somewhere() -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", README):
+        assert target.startswith("https://") or (ROOT / target).exists(), target
+
+
+def test_the_results_are_those_of_the_run() -> None:
+    run_folder = ROOT / "experiments" / "badcl_official"
+    metrics = json.loads((run_folder / "test" / "eigen" / "metrics.json").read_text())["metrics"]
+    for name, values in metrics.items():
+        row = re.search(rf"^\| {name.replace('_', ' ')}[^|]*\|(.*)\|$", README, re.MULTILINE)
+        assert row, name
+        shown = [cell.strip() for cell in row[1].split("|")]
+        assert shown == [f"{values[key]:.3f}" for key in ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")]
+
+
+def test_the_data_table_lists_every_choice() -> None:
+    listed = set(re.findall(r"^\| `(\w+)` \|", README, re.MULTILINE))
+    assert listed == {path.stem for path in (ROOT / "conf" / "data").glob("*.yaml")} - {"base"}
+
+
+def test_make_help_lists_every_target() -> None:
+    done = subprocess.run(["make", "help"], cwd=ROOT, text=True, capture_output=True, check=True)
+    for target in ("help", "install", "demo", "test", "lint", "format", "clean"):
+        assert re.search(rf"^{target}\s+\w", done.stdout, re.MULTILINE)
+
+
+def test_the_version_is_said_once_everywhere() -> None:
+    from hudepth import __version__
+
+    assert f'version = "{__version__}"' in (ROOT / "pyproject.toml").read_text()
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
