@@ -26,8 +26,13 @@ from hudepth.viz.panels import Panel, draw_panels, save_panels
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:
-    """Return what was logged for the epoch that ends now, by name."""
-    return {name: value.item() for name, value in sorted(trainer.callback_metrics.items())}
+    """Return what was logged for the epoch that ends now, by name.
+
+    Lightning keeps the values of the last validation, which in an epoch without one are not this epoch's.
+    """
+    validated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+    metrics = sorted(trainer.callback_metrics.items())
+    return {name: value.item() for name, value in metrics if validated or not name.startswith("val/")}
 
 
 class History(Callback):
@@ -78,7 +83,7 @@ class EpochLine(Callback):
     """Logs one line an epoch: losses, metrics, time taken and time left.
 
     Args:
-        monitor: the metric that decides which checkpoint is best, shown first.
+        monitor: the metric that decides which checkpoint is best, shown after the losses.
     """
 
     SHOWN = ("val/abs_rel", "val/rmse", "val/delta1")

@@ -57,6 +57,8 @@ class Checkpoint:
     """The run's resolved configuration."""
     split: dict[str, Any]
     """Summary of the split it was trained on."""
+    data: dict[str, Any]
+    """Source, fingerprint, encoding and number of pairs of the data it was trained on."""
     epoch: int
     """Finished epochs."""
     state: dict[str, Tensor]
@@ -185,18 +187,27 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
     if own.get("version") != VERSION:
         raise CheckpointError(f"'{path}' has checkpoint version {own.get('version')}; this hudepth reads {VERSION}.")
-    config, split, epoch = own.get("config"), own.get("split"), content.get("epoch")
+    config, split, data, epoch = own.get("config"), own.get("split"), own.get("data"), content.get("epoch")
     if not (
         isinstance(config, dict)
         and isinstance(config.get("model"), dict)
         and isinstance(split, dict)
+        and isinstance(data, dict)
         and isinstance(epoch, int)
         and _is_state(content["state_dict"])
     ):
-        raise CheckpointError(f"'{path}' is incomplete: its configuration, split, epoch or tensors are not there.")
+        raise CheckpointError(
+            f"'{path}' is incomplete: its configuration, split, data, epoch or tensors are not there."
+        )
     state = {n.removeprefix(NET_PREFIX): v for n, v in content["state_dict"].items() if n.startswith(NET_PREFIX)}
     return Checkpoint(
-        path=path, run=run_dir.run_of(path.resolve()), config=config, split=split, epoch=epoch + 1, state=state
+        path=path,
+        run=run_dir.run_of(path.resolve()),
+        config=config,
+        split=split,
+        data=data,
+        epoch=epoch + 1,
+        state=state,
     )
 
 

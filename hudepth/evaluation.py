@@ -83,6 +83,10 @@ class Evaluation(LightningModule):
         self.max_depth_m = max_depth_m
         self._rows: dict[tuple[str, str], list[Tensor]] = {}
         self._indices: list[Tensor] = []
+        self.indices: list[int] = []
+        """Store positions of the scored images, in the order of the rows; known when the test has ended."""
+        self.sums: dict[tuple[str, str], Float[Tensor, "n k"]] = {}
+        """Rows by predictor and protocol, an image each; known when the test has ended."""
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score a batch."""
@@ -93,19 +97,16 @@ class Evaluation(LightningModule):
                 sums = protocol.score(pred_m, batch, max_depth_m=self.max_depth_m)
                 self._rows.setdefault((name, protocol.name), []).append(sums.cpu())
 
-    def indices(self) -> list[int]:
-        """Return the store positions of the scored images, in the order of the rows."""
-        return torch.cat(_gather(torch.cat(self._indices))).tolist()
+    def on_test_epoch_end(self) -> None:
+        """Collect the rows of all processes, in the order of the store."""
+        indices = torch.cat(self._collected(self._indices))
+        order = indices.argsort()
+        self.indices = indices[order].tolist()
+        self.sums = {key: torch.cat(self._collected(rows))[order] for key, rows in self._rows.items()}
 
-    def sums(self, predictor: str, protocol: str) -> Float[Tensor, "n k"]:
-        """Return the rows of one predictor under one protocol, over all processes."""
-        return torch.cat(_gather(torch.cat(self._rows[predictor, protocol])))
-
-
-def _gather(own: Tensor) -> list[Tensor]:
-    """Collect a tensor from every process; they may differ in length."""
-    if not torch.distributed.is_initialized():
-        return [own]
-    everyone: list[Tensor] = [own] * torch.distributed.get_world_size()
-    torch.distributed.all_gather_object(everyone, own)
-    return everyone
+    def _collected(self, own: list[Tensor]) -> list[Tensor]:
+        if self.trainer.world_size == 1:
+            return own
+        everyone: list[list[Tensor]] = [[]] * self.trainer.world_size
+        torch.distributed.all_gather_object(everyone, own)
+        return [rows for process in everyone for rows in process]

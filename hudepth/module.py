@@ -84,7 +84,7 @@ class DepthModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of the whole validation subset."""
-        self.log_dict({k: v.float() for k, v in self.val_metrics.compute().items()})
+        self.log_dict({k: v.float() for k, v in self.val_metrics.compute().items()}, sync_dist=True)
         self.val_metrics.reset()
 
     def on_train_epoch_end(self) -> None:

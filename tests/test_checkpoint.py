@@ -49,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         max_depth_m=10.0,
         optimizer=partial(torch.optim.AdamW, lr=1e-2),
         scheduler=partial(torch.optim.lr_scheduler.OneCycleLR, max_lr=1e-2, total_steps=5),
-        record={"config": config, "split": data.split.summary()},
+        record={"config": config, "split": data.split.summary(), "data": {"source": "rooms", "pairs": 12}},
     )
     Trainer(
         accelerator="cpu",
@@ -123,6 +123,7 @@ def test_a_checkpoint_says_what_it_is_of(run: Path) -> None:
     assert checkpoint.split["kind"] == "official"
     assert checkpoint.split["counts"] == {"train": 8, "val": 2, "test": 2}
     assert len(checkpoint.split["sha256"]) == 64
+    assert checkpoint.data == {"source": "rooms", "pairs": 12}
 
 
 def test_a_moved_checkpoint_needs_nothing_beside_it(run: Path, tmp_path: Path) -> None:
@@ -158,7 +159,7 @@ def test_building_does_not_read_the_trunks_first_weights_again(tmp_path: Path) -
 def written(folder: Path, model: dict[str, Any], net: nn.Module, **more: Any) -> Path:
     """Write a checkpoint of ``net`` that says it is of ``model``."""
     state = {f"net.{name}": value for name, value in net.state_dict().items()}
-    own = {"version": VERSION, "config": {"model": model}, "split": {}}
+    own = {"version": VERSION, "config": {"model": model}, "split": {}, "data": {}}
     return saved(folder / "x.ckpt", {"epoch": 4, "state_dict": state, KEY: own, **more})
 
 
@@ -337,8 +338,9 @@ def test_another_version(run: Path, tmp_path: Path, version: object) -> None:
     [
         {KEY: {"version": VERSION}},
         {KEY: {"version": VERSION, "config": {"model": MODEL}}},
-        {KEY: {"version": VERSION, "config": {"model": "x"}, "split": {}}},
-        {KEY: {"version": VERSION, "config": {}, "split": {}}},
+        {KEY: {"version": VERSION, "config": {"model": MODEL}, "split": {}}},
+        {KEY: {"version": VERSION, "config": {"model": "x"}, "split": {}, "data": {}}},
+        {KEY: {"version": VERSION, "config": {}, "split": {}, "data": {}}},
         {"epoch": "three"},
         {"state_dict": [1]},
         {"state_dict": {"net.x": "not a tensor"}},
@@ -347,7 +349,7 @@ def test_another_version(run: Path, tmp_path: Path, version: object) -> None:
 )
 def test_incomplete(run: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     path = saved(tmp_path / "x.ckpt", {**content_of(run), **change})
-    assert refused(path) == f"'{path}' is incomplete: its configuration, split, epoch or tensors are not there."
+    assert refused(path) == f"'{path}' is incomplete: its configuration, split, data, epoch or tensors are not there."
 
 
 # --- finding one ------------------------------------------------------------------------------------------------

@@ -41,7 +41,8 @@ def without_known_warnings() -> Iterator[None]:
         warnings.filterwarnings("ignore", ".*does not have many workers.*")  # reading a store needs none
         warnings.filterwarnings("ignore", ".*exists and is not empty.*")  # the run directory, by design
         warnings.filterwarnings("ignore", ".*LeafSpec.*")  # between Lightning and torch
-        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # its greetings
+        for name in ("lightning.pytorch", "lightning.fabric"):
+            logging.getLogger(name).setLevel(logging.WARNING)  # their greetings
         yield
 
 

@@ -44,6 +44,7 @@ def test(cfg: DictConfig) -> None:
     config = plain(cfg)
     checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
     config["data"], other_data = _data_config(checkpoint, config.get("data") or {})
+    log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data["source"])
     datamodule = build_data(config["data"], trust=config["trust"])
     if not other_data:
         _restore_split(checkpoint, datamodule)
@@ -73,6 +74,8 @@ def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
     """Use the very split of the training run: from its split.json, else made again and compared by hash."""
     if checkpoint.run and (checkpoint.run / "split.json").is_file():
         datamodule.split = load_split(checkpoint.run / "split.json", datamodule.store.records)
+    if datamodule.store.info["fingerprint"] != checkpoint.data["fingerprint"]:
+        log.warning("the files of %s have changed since the checkpoint was trained", datamodule.source.name)
     if datamodule.split.sha256 != checkpoint.split.get("sha256"):
         raise DataError(
             f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so test pairs "
@@ -107,11 +110,11 @@ def score_checkpoint(
         trainer = _trainer(config["trainer"])
         trainer.test(evaluation, datamodule=datamodule, verbose=False)
     results = {}
-    indices = evaluation.indices()
+    indices = evaluation.indices
     shared = _stamp(checkpoint, datamodule)
     for protocol in protocols:
         folder = output / protocol.name
-        sums = {name: evaluation.sums(name, protocol.name) for name in predictors}
+        sums = {name: evaluation.sums[name, protocol.name] for name in predictors}
         metrics = {name: protocol.summary(rows) for name, rows in sums.items()}
         results[protocol.name] = metrics
         if trainer.is_global_zero:
@@ -129,23 +132,24 @@ def score_checkpoint(
         panels = make_panels(predictors[MODEL], store, shown, max_depth_m=datamodule.max_depth_m)
         for protocol in protocols:
             save_panels(output / protocol.name / "panels.png", panels)
-    log.info("written to %s", output.resolve())
+    log.info("tables and pictures: %s", output.resolve())
     return results
 
 
 def _trainer(options: dict[str, Any]) -> Trainer:
-    used = {key: options[key] for key in ("accelerator", "precision") if key in options}
-    return Trainer(
-        **used,
-        devices=1,
-        logger=False,
-        callbacks=[RichProgressBar()] if shows_progress() else None,
-        enable_checkpointing=False,
-        enable_model_summary=False,
-        enable_progress_bar=shows_progress(),
-        use_distributed_sampler=False,
-        inference_mode=True,
-    )
+    try:
+        return Trainer(
+            **{"devices": 1, **options},
+            logger=False,
+            callbacks=[RichProgressBar()] if shows_progress() else None,
+            enable_checkpointing=False,
+            enable_model_summary=False,
+            enable_progress_bar=shows_progress(),
+            use_distributed_sampler=False,
+            inference_mode=True,
+        )
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"trainer: {error}") from error
 
 
 def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any]:
@@ -155,7 +159,11 @@ def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any
         "split": datamodule.split.summary(),
         "network_size": list(datamodule.size),
         "max_depth_m": datamodule.max_depth_m,
-        "checkpoint": {"file": checkpoint.path.name, "epoch": checkpoint.epoch, "trained_on": checkpoint.split},
+        "checkpoint": {
+            "file": checkpoint.path.name,
+            "epoch": checkpoint.epoch,
+            "trained_on": {**checkpoint.data, "split": checkpoint.split},
+        },
     }
 
 

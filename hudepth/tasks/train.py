@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import traceback
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from hudepth import run_dir
@@ -58,14 +61,27 @@ def train(cfg: DictConfig) -> float | None:
     else:
         config = plain(cfg)
         path = _run_path(config)
-        environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
-        run_dir.write_start(path, config=config, overrides=overrides, environment=environment)
+        if _first_process():
+            environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
+            run_dir.write_start(path, config=config, overrides=overrides, environment=environment)
+    if not _first_process():
+        log.setLevel(logging.WARNING)
     os.environ[RUN_ENV] = str(path)
     try:
         with run_dir.logged_to(path / "train.log"):
             return _run(config, path, resume=bool(cfg.resume))
     finally:
         os.environ.pop(RUN_ENV, None)
+
+
+def _first_process() -> bool:
+    """Tell whether this process writes to the run directory: of a distributed run only the first does."""
+    return rank_zero_only.rank == 0
+
+
+def _status(path: Path, state: str, **more: Any) -> None:
+    if _first_process():
+        run_dir.write_status(path, state, **more)
 
 
 def _run_path(config: dict[str, Any]) -> Path:
@@ -113,7 +129,7 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
 def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
     """Fit and test inside a run directory, whose status always tells how it went."""
     try:
-        run_dir.write_status(path, "running")
+        _status(path, "running")
         best = _fit(config, path, resume=resume)
     except HudepthError as error:
         _failed(path, str(error))
@@ -124,13 +140,13 @@ def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
             f"{error.strerror or error} ('{error.filename or path}'). See {path / 'train.log'}."
         ) from error
     except (KeyboardInterrupt, SystemExit):
-        run_dir.write_status(path, "interrupted")
+        _status(path, "interrupted")
         log.info("interrupted; continue with: hudepth-train resume=%s", path)
         raise
     except BaseException as error:
         _failed(path, f"{type(error).__name__}: {error}")
         raise
-    run_dir.write_status(path, "finished", **({"best": best} if best is not None else {}))
+    _status(path, "finished", best=best)
     return best
 
 
@@ -138,7 +154,7 @@ def _failed(path: Path, message: str) -> None:
     try:
         with (path / "train.log").open("a", encoding="utf-8") as file:
             file.write(traceback.format_exc())
-        run_dir.write_status(path, "failed", error=message)
+        _status(path, "failed", error=message)
     except OSError:  # a full disk is the likely reason to be here; the message below still goes to the terminal
         log.warning("the status in '%s' could not be written", path)
 
@@ -154,7 +170,7 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
     split_file = path / "split.json"
     if resume and split_file.exists():
         datamodule.split = load_split(split_file, datamodule.store.records)
-    else:
+    elif _first_process():
         save_split(split_file, datamodule.split, datamodule.store.records)
     module = build_module(config, datamodule, trust=trust)
     callbacks = _callbacks(config, path, datamodule)
@@ -164,23 +180,20 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d, %s, %d threads",
         type(module.net).__name__, f"{sum(p.numel() for p in module.net.parameters()):,}", datamodule.source.name,
         datamodule.split.kind, len(datamodule.split.train), len(datamodule.split.val), len(datamodule.split.test),
-        datamodule.batch_size, trainer.accelerator.__class__.__name__.removesuffix("Accelerator"), _threads(),
+        datamodule.batch_size, trainer.accelerator.__class__.__name__.removesuffix("Accelerator"), torch.get_num_threads(),
     )  # fmt: skip
     last = path / run_dir.CHECKPOINTS / run_dir.LAST
     with without_known_warnings():
         trainer.fit(module, datamodule=datamodule, ckpt_path=last if resume else None, weights_only=True)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
     score = best.best_model_score
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()  # one process tests: it should wait for no other
     if config["test"] and trainer.is_global_zero:
         checkpoint = load_checkpoint(str(path))
-        score_checkpoint(checkpoint, config=config, output=path / "test", datamodule=datamodule)
+        options = {key: config["trainer"][key] for key in ("accelerator", "precision")}  # one device: exact, and enough
+        score_checkpoint(checkpoint, config={**config, "trainer": options}, output=path / "test", datamodule=datamodule)
     return None if score is None else float(score)
-
-
-def _threads() -> int:
-    import torch
-
-    return torch.get_num_threads()
 
 
 def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: list[str]) -> DepthModule:
@@ -197,7 +210,11 @@ def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: 
         max_depth_m=datamodule.max_depth_m,
         optimizer=partial(instantiate, config["optim"], trust=trust),
         scheduler=partial(instantiate, schedule, trust=trust) if scheduled else None,
-        record={"config": config, "split": datamodule.split.summary()},
+        record={
+            "config": config,
+            "split": datamodule.split.summary(),
+            "data": {key: datamodule.store.info[key] for key in ("source", "fingerprint", "encoding", "pairs")},
+        },
     )
 
 

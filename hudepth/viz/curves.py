@@ -37,19 +37,28 @@ def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> F
     Args:
         history: rows with ``epoch``, ``train/<name>`` and ``val/<name>``.
         title: above the figure.
+
+    Raises:
+        DataError: if the history holds no training loss.
     """
     names = [key.removeprefix("train/") for key in history[0] if key.startswith("train/")]
+    if not names:
+        raise DataError("the history of epochs holds no training loss (train/total). Pass that of a training run.")
     names.sort(key=lambda name: name != "total")
     figure = Figure(figsize=(3.4 * len(names), 3.2), dpi=110, layout="constrained")
     if title:
         figure.suptitle(title, fontsize=10)
-    epochs = [row["epoch"] for row in history]
+    first, last = history[0]["epoch"], history[-1]["epoch"]
     for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         for stage, label in (("train", "training"), ("val", "validation")):
-            axis.plot(epochs, [row.get(f"{stage}/{name}", float("nan")) for row in history], marker=".", label=label)
+            key = f"{stage}/{name}"
+            points = [(row["epoch"], row[key]) for row in history if key in row]  # not every epoch validates
+            if points:
+                axis.plot(*zip(*points, strict=True), marker=".", label=label)
         axis.set_title(f"{name} loss", fontsize=10)
         axis.set_xlabel("epoch")
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.set_xlim(first - 0.5, last + 0.5)
+        axis.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=1))
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
     axis.legend()

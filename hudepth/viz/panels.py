@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -17,6 +20,10 @@ from hudepth.files import written_whole
 DEPTH_COLOURS = "turbo_r"
 """Near is red, far is blue."""
 ERROR_COLOURS = "magma"
+UNMEASURED_COLOUR = "0.75"
+"""Light grey, which neither scale contains."""
+MIN_SPAN_M = 0.1
+"""No scale is narrower than this."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +33,7 @@ class Panel:
     image: NDArray[np.uint8]
     """[h, w, 3] RGB."""
     truth_m: NDArray[np.float32]
-    """[h, w] metres, 0 where unmeasured (shown white)."""
+    """[h, w] metres, 0 where unmeasured (shown grey)."""
     pred_m: NDArray[np.float32]
     """[h, w] metres."""
     title: str = ""
@@ -35,7 +42,8 @@ class Panel:
 def draw_panels(panels: Sequence[Panel]) -> NDArray[np.uint8]:
     """Draw one row a panel: RGB, truth, prediction, absolute error.
 
-    All depths share one scale, from the smallest to the largest truth, and all errors another, so that rows compare.
+    All depths share one scale, from the smallest to the largest truth, and all errors another, up to the 99th
+    percentile, so that rows compare.
 
     Args:
         panels: at least one.
@@ -63,25 +71,64 @@ def save_figure(path: Path, figure: Figure) -> None:
 def _figure(panels: Sequence[Panel]) -> Figure:
     measured = np.concatenate([panel.truth_m[panel.truth_m > 0] for panel in panels])
     low, high = (float(measured.min()), float(measured.max())) if measured.size else (0.0, 1.0)
+    if high - low < MIN_SPAN_M:  # one depth everywhere: a scale of no width would name no depth
+        low, high = max(0.0, low - MIN_SPAN_M / 2), low + MIN_SPAN_M / 2
     errors = [np.ma.masked_where(panel.truth_m <= 0, np.abs(panel.pred_m - panel.truth_m)) for panel in panels]
     wrongs = np.concatenate([error.compressed() for error in errors])
-    worst = max(0.1, float(np.percentile(wrongs, 99))) if wrongs.size else 1.0  # outliers should not darken the rest
+    wrongs = wrongs[np.isfinite(wrongs)]
+    worst = max(MIN_SPAN_M, float(np.percentile(wrongs, 99))) if wrongs.size else 1.0  # outliers darken the rest
 
-    height, width = panels[0].image.shape[:2]
-    figure = Figure(figsize=(10.5, 0.7 + 2.35 * height / width * len(panels)), dpi=110, layout="constrained")
-    axes = figure.subplots(len(panels), 4, squeeze=False)
-    for title, axis in zip(("image", "truth", "prediction", "absolute error"), axes[0], strict=True):
-        axis.set_title(title, fontsize=10)
-    for row, panel, error in zip(axes, panels, errors, strict=True):
+    figure, cells, bars = _layout(len(panels), aspect=panels[0].image.shape[0] / panels[0].image.shape[1])
+    for title, cell in zip(("image", "truth", "prediction", "absolute error"), cells[0], strict=True):
+        cell.set_title(title, fontsize=11, pad=5)
+    depth_scale: dict[str, Any] = {"cmap": _colours(DEPTH_COLOURS), "vmin": low, "vmax": high}
+    for row, panel, error in zip(cells, panels, errors, strict=True):
         row[0].imshow(panel.image)
-        truth = np.ma.masked_where(panel.truth_m <= 0, panel.truth_m)
-        depth = row[1].imshow(truth, cmap=DEPTH_COLOURS, vmin=low, vmax=high)
-        row[2].imshow(panel.pred_m, cmap=DEPTH_COLOURS, vmin=low, vmax=high)
-        wrong = row[3].imshow(error, cmap=ERROR_COLOURS, vmin=0, vmax=worst)
-        row[0].set_ylabel(panel.title, fontsize=8)
-        for axis in row:
-            axis.set_xticks([])
-            axis.set_yticks([])
-    figure.colorbar(depth, ax=axes[:, 1:3], location="bottom", label="depth [m]", shrink=0.6, aspect=40)
-    figure.colorbar(wrong, ax=axes[:, 3:], location="bottom", label="error [m]", shrink=0.9)
+        row[1].imshow(np.ma.masked_where(panel.truth_m <= 0, panel.truth_m), **depth_scale)
+        depth = row[2].imshow(panel.pred_m, **depth_scale)
+        wrong = row[3].imshow(error, cmap=_colours(ERROR_COLOURS), vmin=0, vmax=worst)
+        row[0].set_ylabel(_shortened(panel.title, row[0]), fontsize=8)
+    figure.colorbar(depth, cax=bars[0], orientation="horizontal", extend="both", label="depth [m]")
+    figure.colorbar(wrong, cax=bars[1], orientation="horizontal", extend="max", label="absolute error [m]")
     return figure
+
+
+def _layout(rows: int, *, aspect: float) -> tuple[Figure, list[list[Axes]], list[Axes]]:
+    """Return a figure with ``rows`` of four cells and, below, the axes of the two scales.
+
+    Everything is placed in inches: with rows of any number and shape, gaps, letters and scales keep their size.
+    """
+    cell, gap, left, top, bottom, bar = 2.6, 0.07, 0.3, 0.32, 0.62, 0.11
+    width = left + 4 * cell + 3 * gap + 0.1
+    height = top + rows * (cell * aspect + gap) + bottom
+    figure = Figure(figsize=(width, height), dpi=110)
+
+    def axes(x: float, y: float, w: float, h: float) -> Axes:
+        return figure.add_axes((x / width, y / height, w / width, h / height))
+
+    x = [left + column * (cell + gap) for column in range(4)]
+    cells = [
+        [axes(x[c], height - top - (r + 1) * cell * aspect - r * gap, cell, cell * aspect) for c in range(4)]
+        for r in range(rows)
+    ]
+    for axis in (axis for row in cells for axis in row):
+        axis.set_xticks([])
+        axis.set_yticks([])
+    y = bottom - bar - 0.02
+    inset = 0.2  # between a scale's ends and the columns it belongs to
+    bars = [axes(x[1] + inset, y, 2 * cell + gap - 2 * inset, bar), axes(x[3] + inset, y, cell - 2 * inset, bar)]
+    for scale in bars:
+        scale.tick_params(labelsize=9)
+    return figure, cells, bars
+
+
+def _colours(name: str) -> Colormap:
+    return colormaps[name].with_extremes(bad=UNMEASURED_COLOUR)
+
+
+def _shortened(title: str, axis: Axes) -> str:
+    """Cut the front of a title that is longer than its row is high: frame numbers stand at the end."""
+    figure = axis.get_figure()
+    assert figure is not None
+    room = int(axis.get_position().height * figure.bbox.height / figure.dpi * 15)  # letters of 8 points
+    return title if len(title) <= room else f"…{title[len(title) - room + 1 :]}"

@@ -65,9 +65,9 @@ def test_depth_takes_the_nearest_pixel(height: int, width: int, h: int, w: int) 
 
 
 def test_images_shrink_to_the_mean_of_what_each_pixel_covers() -> None:
-    pair = random_pair(24, 32)
-    expected = pair.image.reshape(12, 2, 16, 2, 3).mean(axis=(1, 3))
-    found = prepare_one(pair, (12, 16)).image
+    pair = random_pair(24, 36)
+    expected = pair.image.reshape(8, 3, 12, 3, 3).mean(axis=(1, 3))
+    found = prepare_one(pair, (8, 12)).image
     assert found.dtype == np.uint8
     assert np.abs(found - expected).max() <= 0.5
 

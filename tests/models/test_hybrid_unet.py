@@ -162,6 +162,7 @@ def test_output_range(output: str, low: float, high: float | None) -> None:
 
 
 def test_identity_output_is_what_the_others_are_made_of() -> None:
+    torch.manual_seed(1)
     image = torch.randn(1, 3, 32, 32)
     made = {}
     for output in ("identity", "sigmoid", "relu", "softplus"):
@@ -246,6 +247,22 @@ def test_gradient_reaches_every_parameter() -> None:
     unreached = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     assert unreached == []
     assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
+
+
+def test_the_parts_are_joined_as_the_table_says(net: HybridUNet) -> None:
+    """Skip 2 is layer2's output after its transformer block, skip 1 layer1's output, skip 0 the stem's."""
+    net.eval()
+    image = torch.randn(1, 3, 64, 48)
+    trunk = net.trunk
+    skip0 = trunk.relu(trunk.bn1(trunk.conv1(image)))
+    skip1 = trunk.layer1(trunk.maxpool(skip0))
+    layer2 = trunk.layer2(skip1)
+    deepest = net.attention_deepest(trunk.layer3(layer2))
+    x = net.up3(net.up2(net.up1(deepest, net.attention_skip(layer2)), skip1), skip0)
+    expected = torch.sigmoid(net.head(net.head_up(x)))
+    assert torch.equal(net(image), expected)
+    for part in (skip0, skip1, layer2, deepest):
+        assert part.std() > 0.1  # so that a part that is left out shows
 
 
 @pytest.mark.parametrize("size", [(32, 64), (96, 48), (16, 16)])

@@ -1,0 +1,89 @@
+"""Batches straight from the store, and shards that neither lose nor repeat a pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.utils.data import DataLoader
+
+from hudepth.data.dataset import ShardSampler, StoreDataset, as_is
+from hudepth.data.sources.base import Record
+from hudepth.data.store import DepthStore, StoreWriter
+
+N, SIZE = 6, (3, 5)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> DepthStore:
+    path = tmp_path_factory.mktemp("store") / "a.h5"
+    writer = StoreWriter(path, size=SIZE, native=True)
+    rng = np.random.default_rng(0)
+    for i in range(N):
+        native = cv2.imencode(".png", np.full((4 + i, 7), 1000 * i + 1, np.uint16))[1].ravel()
+        image, depth = rng.integers(0, 256, (*SIZE, 3), np.uint8), rng.integers(0, 65536, SIZE, np.uint16)
+        writer.append(Record(str(i), "", i), image, depth, native)
+    writer.close({})
+    return DepthStore(path)
+
+
+def test_a_batch_holds_the_rows_asked_for(store: DepthStore) -> None:
+    dataset = StoreDataset(store, [5, 0, 3])
+    assert len(dataset) == 3
+    batch = dataset.__getitems__([2, 0, 2])
+    images, depths = store.read([3, 5, 3])
+    assert sorted(batch) == ["depth_mm", "image", "index"]
+    assert (batch["image"].dtype, batch["depth_mm"].dtype) == (torch.uint8, torch.uint16)
+    np.testing.assert_array_equal(batch["image"].numpy(), images)
+    np.testing.assert_array_equal(batch["depth_mm"].numpy(), depths)
+    assert batch["index"].tolist() == [3, 5, 3]
+
+
+def test_one_item_is_a_batch_of_one(store: DepthStore) -> None:
+    batch = StoreDataset(store, [4, 2])[1]
+    assert batch["image"].shape == (1, *SIZE, 3)
+    assert batch["index"].tolist() == [2]
+
+
+def test_native_truth_comes_in_its_own_sizes(store: DepthStore) -> None:
+    batch = StoreDataset(store, range(N), native=True).__getitems__([4, 1])
+    assert [depth.shape for depth in batch["native_depth"]] == [(1, 8, 7), (1, 5, 7)]
+    assert [depth.unique().tolist() for depth in batch["native_depth"]] == [
+        [float(np.float32(4.001))], [float(np.float32(1.001))],
+    ]  # fmt: skip
+
+
+def test_a_position_beyond_the_subset_is_an_error(store: DepthStore) -> None:
+    with pytest.raises(IndexError):
+        StoreDataset(store, [0, 1])[2]
+
+
+def test_as_is_hands_batches_through_a_loader(store: DepthStore) -> None:
+    batches: list[Any] = list(DataLoader(StoreDataset(store, range(N)), batch_size=4, collate_fn=as_is))
+    assert [batch["index"].tolist() for batch in batches] == [[0, 1, 2, 3], [4, 5]]
+
+
+@given(length=st.integers(0, 50), world_size=st.integers(1, 12))
+def test_shards_partition_exactly(length: int, world_size: int) -> None:
+    shards = [ShardSampler(length, rank=rank, world_size=world_size) for rank in range(world_size)]
+    positions = [list(shard) for shard in shards]
+    assert sorted(position for each in positions for position in each) == list(range(length))
+    assert [len(shard) for shard in shards] == [len(each) for each in positions]
+    assert max(map(len, positions)) - min(map(len, positions)) <= 1
+    assert all(each == sorted(each) for each in positions)
+    assert [list(shard) for shard in shards] == positions  # a second pass goes the same way
+
+
+def test_the_store_is_found_again_after_pickling(store: DepthStore, tmp_path: Path) -> None:
+    dataset = StoreDataset(store, [1, 2], native=True)
+    before = dataset[0]
+    torch.save(dataset, tmp_path / "dataset")
+    after = torch.load(tmp_path / "dataset", weights_only=False)[0]
+    assert torch.equal(before["image"], after["image"])
+    assert torch.equal(before["native_depth"][0], after["native_depth"][0])
