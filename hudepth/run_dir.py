@@ -76,6 +76,21 @@ def write_start(
         ) from error
 
 
+def write_resumed(path: Path, *, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
+    """Write what a resumed run goes on with: config.yaml anew, overrides.txt with what was typed now below it.
+
+    Raises:
+        ConfigError: if the folder cannot be written.
+    """
+    try:
+        typed = path / "overrides.txt"
+        earlier = typed.read_text(encoding="utf-8") if typed.is_file() else ""
+        write_text(path / "config.yaml", yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
+        write_text(typed, earlier + "".join(f"{line}\n" for line in overrides))
+    except OSError as error:
+        raise ConfigError(f"'{path}' cannot be written ({error.strerror}), so the run cannot go on.") from error
+
+
 def read_config(path: Path) -> dict[str, Any]:
     """Read a run's config.yaml as plain Python.
 
@@ -128,9 +143,7 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
         "packages": {name: _version(name) for name in PACKAGES},
         "git": _git(),
         "accelerator": accelerator,
-        "device": torch.cuda.get_device_name()
-        if torch.cuda.is_available()
-        else platform.processor() or platform.machine(),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else _processor(),
         "threads": torch.get_num_threads(),
         "seed": seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
@@ -142,6 +155,13 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None  # another build of it, for example opencv-python, or a source tree that was never installed
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")  # Linux names the model here only
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
 
 
 def _git() -> dict[str, Any] | None:

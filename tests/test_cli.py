@@ -86,14 +86,14 @@ def test_cfg_prints_the_configuration_without_torch(tmp_path: Path) -> None:
 
 
 def test_tab_completion(tmp_path: Path) -> None:
-    script = """
-    PATH={bin}:$PATH
+    script = f"""
+    PATH={BIN}:$PATH
     eval "$(hudepth-train -sc install=bash)"
     complete -p hudepth-train >/dev/null || exit 3
     COMP_LINE="hudepth-train loss=" COMP_POINT=19 COMP_CWORD=1
     hydra_bash_completion
     echo "${{COMPREPLY[@]}}"
-    """.format(bin=BIN)
+    """
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, text=True, capture_output=True, check=False)
     assert "loss=berhu" in done.stdout, done.stdout + done.stderr
 

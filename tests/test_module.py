@@ -98,6 +98,14 @@ def test_validation_metrics_are_those_of_the_whole_subset(cache: Path, batch_siz
         assert trainer.callback_metrics[f"val/{name}"].item() == pytest.approx(expected, rel=1e-6, abs=1e-6), name
 
 
+def test_validation_starts_anew_each_epoch(cache: Path) -> None:
+    data, module, trainer = make_data(cache), make_module(lr=0.5), make_trainer(max_epochs=3)
+    trainer.fit(module, datamodule=data)
+    in_training = {name: value.item() for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
+    afterwards = make_trainer().validate(module, datamodule=data, verbose=False)[0]
+    assert afterwards == pytest.approx(in_training, rel=1e-6)
+
+
 class Spy(Callback):
     """Keeps what the module's loss returned for each training batch and the learning rate of each epoch."""
 

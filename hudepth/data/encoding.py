@@ -168,7 +168,8 @@ def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding
         raise DataError(
             f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, "
             f"indoor sets lie in {low:g} to {high:g} m. "
-            f"Pass another data.encoding ({_others(encoding)}), or data.source.indoor=false."
+            f"Pass another data.encoding ({_others(encoding)}); "
+            "folders and manifests that are not indoors take data.source.indoor=false."
         )
     return found
 

@@ -141,8 +141,8 @@ class Protocol:
             "resize": "bilinear, align_corners=False" if self.needs_native else "none",
             "crop": list(self.crop) if self.crop else None,
             "crop_size": list(self.crop_size) if self.crop else None,
-            "valid": f"measured, {self.min_depth_m} m < truth"
-            + ("" if self.max_depth_m is None else f" < {self.max_depth_m} m"),
+            "valid": f"measured, {self.min_depth_m:.15g} m < truth"
+            + ("" if self.max_depth_m is None else f" < {self.max_depth_m:.15g} m"),
             "clamp_m": [self.min_depth_m, self.max_depth_m] if self.clamp else None,
             "averaging": self.averaging,
             "alignment": "none",

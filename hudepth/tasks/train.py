@@ -58,6 +58,8 @@ def train(cfg: DictConfig) -> float | None:
     if cfg.resume:
         path = Path(cfg.resume).expanduser().resolve()
         config = resumed_config(path, overrides)
+        if _first_process():
+            run_dir.write_resumed(path, config=config, overrides=overrides)
     else:
         config = plain(cfg)
         path = _run_path(config)
@@ -76,7 +78,7 @@ def train(cfg: DictConfig) -> float | None:
 
 def _first_process() -> bool:
     """Tell whether this process writes to the run directory: of a distributed run only the first does."""
-    return rank_zero_only.rank == 0
+    return bool(getattr(rank_zero_only, "rank", 0) == 0)
 
 
 def _status(path: Path, state: str, **more: Any) -> None:

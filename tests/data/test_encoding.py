@@ -225,7 +225,8 @@ def test_range_refuses_an_implausible_room(depth_m: float, shown: str) -> None:
         check_range(depths, indoor=True, encoding="uint16_mm", name="folder")
     assert str(caught.value) == (
         f"data.encoding=uint16_mm: 'folder' has a median depth of {shown} m, indoor sets lie in 0.3 to 20 m. "
-        "Pass another data.encoding (uint8_10m, float_m, linear, paper_literal), or data.source.indoor=false."
+        "Pass another data.encoding (uint8_10m, float_m, linear, paper_literal); "
+        "folders and manifests that are not indoors take data.source.indoor=false."
     )
     assert check_range(depths, indoor=False, encoding="uint16_mm", name="folder").median_m == np.float32(depth_m)
 

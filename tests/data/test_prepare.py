@@ -327,7 +327,8 @@ def test_implausible_units_are_refused_before_the_rest_is_read(root: Path, cache
     assert message.startswith("data.encoding=uint16_mm: 'folder' has a median depth of 0.0")
     assert message.endswith(
         " m, indoor sets lie in 0.3 to 20 m. Pass another data.encoding "
-        "(uint8_10m, float_m, linear, paper_literal), or data.source.indoor=false."
+        "(uint8_10m, float_m, linear, paper_literal); "
+        "folders and manifests that are not indoors take data.source.indoor=false."
     )
     assert len(source.seen) == UNIT_SAMPLES
     assert int(source.seen[-1]) >= 30  # from all of the set

@@ -352,7 +352,7 @@ def test_the_stamp_of_the_usual_benchmark() -> None:
         "resize": "bilinear, align_corners=False",
         "crop": [45, 471, 41, 601],
         "crop_size": [480, 640],
-        "valid": "measured, 0.001 m < truth < 10.0 m",
+        "valid": "measured, 0.001 m < truth < 10 m",
         "clamp_m": [0.001, 10.0],
         "averaging": "image",
         "alignment": "none",

@@ -157,6 +157,8 @@ def test_resume_adds_epochs_to_a_finished_run(command: Command, tmp_path: Path) 
     two, three = only_run(tmp_path, "two"), only_run(tmp_path, "three")
     done = command("train", f"resume={two}", "trainer.max_epochs=3")
     assert done.code == 0, done.err
+    assert yaml.safe_load((two / "config.yaml").read_text())["trainer"]["max_epochs"] == 3
+    assert (two / "overrides.txt").read_text().splitlines()[-2:] == [f"resume={two}", "trainer.max_epochs=3"]
     assert_same_end(two, three)
 
 
@@ -247,3 +249,18 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path, cache: Pat
     assert f"interrupted; continue with: hudepth-train resume={run}" in out
     assert "Traceback" not in out
     assert status(run)["state"] == "interrupted"
+
+
+def test_two_processes_train_into_one_run_directory(tmp_path: Path, cache: Path) -> None:
+    """Distributed data parallel, on the CPU: one run, one row an epoch, tested once."""
+    distributed = ["trainer.devices=2", "trainer.strategy=ddp"]
+    done = subprocess.run(
+        **script("train", *TINY, *distributed, "name=ddp", cwd=tmp_path, cache=cache), check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stdout
+    run = only_run(tmp_path, "ddp")
+    assert status(run)["state"] == "finished"
+    assert [row["epoch"] for row in history(run)] == ["1", "2"]
+    assert [row["step"] for row in history(run)] == ["2", "4"]  # 8 pairs, two at a time in each of two processes
+    assert (run / "test" / "eigen" / "metrics.json").is_file()
+    assert done.stdout.count("epoch 2 of 2") == 1
