@@ -105,8 +105,10 @@ def main() -> None:
         seconds = {name: runs[name]() for name in order}
         ratios.append(seconds["lightning"] / seconds["bare"])
         rates.append(images / seconds["bare"])
-        print(f"pair {pair + 1}: bare {seconds['bare']:.2f} s, lightning {seconds['lightning']:.2f} s, ratio {ratios[-1]:.3f}")
-    print(f"lightning / bare, {images} images of {options.size} x {options.size}: median {statistics.median(ratios):.3f}")
+        spans = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
+        print(f"pair {pair + 1}: {spans}, ratio {ratios[-1]:.3f}")
+    median = statistics.median(ratios)
+    print(f"lightning / bare, {images} images of {options.size} x {options.size}: median {median:.3f}")
     loader = loader_rate(data)
     training = statistics.median(rates)
     print(f"loader {loader:.0f} images/s, training {training:.1f} images/s, ratio {loader / training:.0f}")

@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.sources.base import Source
 from hudepth.errors import ConfigError
 from hudepth.instantiate import instantiate
 from hudepth.metrics.protocol import Protocol
@@ -53,11 +54,9 @@ def build_data(data: Mapping[str, Any], *, trust: list[str]) -> DepthDataModule:
         ConfigError: if it cannot be built.
     """
     given = {key: data[key] for key in SOURCE_KEYS if key in data}
-    source = instantiate(data["source"], trust=trust, **given)
+    source = instantiate(data["source"], trust=trust, only=Source, **given)
     options = {key: value for key, value in data.items() if key not in (*SOURCE_KEYS, "source")}
-    datamodule = instantiate(options, source, trust=trust)
-    if not isinstance(datamodule, DepthDataModule):
-        raise ConfigError(f"data._target_: {type(datamodule).__name__} is no DepthDataModule.")
+    datamodule: DepthDataModule = instantiate(options, source, trust=trust, only=DepthDataModule)
     return datamodule
 
 
@@ -67,7 +66,7 @@ def build_protocols(protocols: Mapping[str, Any], *, trust: list[str]) -> list[P
     Raises:
         ConfigError: if there is none, or one cannot be built.
     """
-    built = [instantiate(protocol, trust=trust) for protocol in protocols.values() if protocol]
+    built = [instantiate(protocol, trust=trust, only=Protocol) for protocol in protocols.values() if protocol]
     if not built:
         raise ConfigError("protocol: none is given. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
     return built

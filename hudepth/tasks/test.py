@@ -43,8 +43,10 @@ def test(cfg: DictConfig) -> None:
     """
     config = plain(cfg)
     checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
-    config["data"], other_data = _data_config(checkpoint, config.get("data") or {})
-    log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data["source"])
+    # The checkpoint may be a stranger's: it says what to read, but not where to write.
+    own = {"cache": config["paths"]["cache"]}
+    config["data"], other_data = _data_config(checkpoint, {**own, **(config.get("data") or {})})
+    log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data.get("source"))
     datamodule = build_data(config["data"], trust=config["trust"])
     if not other_data:
         _restore_split(checkpoint, datamodule)
@@ -74,12 +76,12 @@ def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
     """Use the very split of the training run: from its split.json, else made again and compared by hash."""
     if checkpoint.run and (checkpoint.run / "split.json").is_file():
         datamodule.split = load_split(checkpoint.run / "split.json", datamodule.store.records)
-    if datamodule.store.info["fingerprint"] != checkpoint.data["fingerprint"]:
+    if datamodule.store.info["fingerprint"] != checkpoint.data.get("fingerprint"):
         log.warning("the files of %s have changed since the checkpoint was trained", datamodule.source.name)
     if datamodule.split.sha256 != checkpoint.split.get("sha256"):
         raise DataError(
-            f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so test pairs "
-            "may have been trained on. Pass the data.root it was trained on, or data=<name> to test on other data."
+            f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so "
+            "test pairs may have been trained on. Pass the data.root it was trained on, or data=<name> to test on other data."
         )
 
 

@@ -18,6 +18,9 @@ from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth import run_dir
 from hudepth.callbacks import (
@@ -182,7 +185,8 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d, %s, %d threads",
         type(module.net).__name__, f"{sum(p.numel() for p in module.net.parameters()):,}", datamodule.source.name,
         datamodule.split.kind, len(datamodule.split.train), len(datamodule.split.val), len(datamodule.split.test),
-        datamodule.batch_size, trainer.accelerator.__class__.__name__.removesuffix("Accelerator"), torch.get_num_threads(),
+        datamodule.batch_size, type(trainer.accelerator).__name__.removesuffix("Accelerator"),
+        torch.get_num_threads(),
     )  # fmt: skip
     last = path / run_dir.CHECKPOINTS / run_dir.LAST
     with without_known_warnings():
@@ -207,11 +211,11 @@ def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: 
     schedule = config["schedule"]
     scheduled = schedule and schedule.get("_target_")
     return DepthModule(
-        instantiate(config["model"], trust=trust),
-        instantiate(config["loss"], trust=trust),
+        instantiate(config["model"], trust=trust, only=nn.Module),
+        instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
-        optimizer=partial(instantiate, config["optim"], trust=trust),
-        scheduler=partial(instantiate, schedule, trust=trust) if scheduled else None,
+        optimizer=partial(instantiate, config["optim"], trust=trust, only=Optimizer),
+        scheduler=partial(instantiate, schedule, trust=trust, only=LRScheduler) if scheduled else None,
         record={
             "config": config,
             "split": datamodule.split.summary(),
@@ -238,13 +242,18 @@ def _callbacks(config: dict[str, Any], path: Path, datamodule: DepthDataModule) 
         callbacks.append(RichProgressBar(leave=False))
     if options["early_stopping"]:
         callbacks.append(EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"]))
-    callbacks += [instantiate(extra, trust=config["trust"]) for extra in options["extra"]]
+    callbacks += [instantiate(extra, trust=config["trust"], only=Callback) for extra in options["extra"]]
     return [*callbacks, *checkpoint_callbacks(path, monitor=monitor, mode=mode)]
 
 
 def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> Trainer:
+    if str(config["trainer"].get("precision", "")).endswith("16-true"):
+        raise ConfigError(
+            f"trainer.precision: {config['trainer']['precision']} keeps the weights in 16 bits, which loses updates. "
+            "Pass bf16-mixed, 16-mixed or 32-true."
+        )
     options = config["logger"]
-    loggers: list[Logger] = [instantiate(extra, trust=config["trust"]) for extra in options["extra"]]
+    loggers: list[Logger] = [instantiate(extra, trust=config["trust"], only=Logger) for extra in options["extra"]]
     if options["tensorboard"]:
         loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
     try:

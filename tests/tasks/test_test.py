@@ -94,7 +94,7 @@ def test_other_data(command: Command, run: Path) -> None:
     ("arguments", "message"),
     [
         (["data.rooot=x"], "data.rooot: the checkpoint's data has no such key."),
-        (["data.source.scenes=7"], "the split of rooms is not the one it was trained on, so test pairs may have been trained on."),
+        (["data.source.scenes=7"], "the split of rooms is not the one it was trained on, so test pairs"),
         (["protocol=eigne"], "protocol: no 'eigne'. Did you mean 'eigen'? Pass one of eigen, paper."),
     ],
 )  # fmt: skip
@@ -140,3 +140,11 @@ def test_a_checkpoint_of_another_model_is_refused(command: Command, trained: Pat
     done = command("test", "checkpoint=other.ckpt")
     assert done.code == 1
     assert "'other.ckpt' is from another model: " in done.err.splitlines()[-1]
+
+
+def test_a_checkpoint_does_not_say_where_to_write(command: Command, trained: Path, tmp_path: Path) -> None:
+    content = read_plain(trained / "checkpoints" / "best.ckpt")
+    content[KEY]["config"]["data"]["cache"] = str(tmp_path / "elsewhere")
+    torch.save(content, tmp_path / "stranger.ckpt")
+    assert command("test", "checkpoint=stranger.ckpt").code == 0
+    assert not (tmp_path / "elsewhere").exists()

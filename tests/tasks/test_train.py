@@ -38,7 +38,7 @@ def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
     expected = {
         "config.yaml", "overrides.txt", "environment.json", "split.json", "status.json", "train.log", "metrics.csv",
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "images/epoch_001.png", "images/epoch_002.png",
-        *(f"test/{protocol}/{name}" for protocol in ("paper", "eigen") for name in ("metrics.json", "per_image.csv", "panels.png")),
+        *(f"test/{p}/{name}" for p in ("paper", "eigen") for name in ("metrics.json", "per_image.csv", "panels.png")),
     }  # fmt: skip
     assert expected <= files
     assert {name.split("/")[0] for name in files - expected} == {"tensorboard"}
@@ -106,7 +106,8 @@ def test_a_root_that_is_missing_gives_one_line(command: Command) -> None:
     done = command("train", "data=nyu_labeled", "data.root=nowhere", "model=tiny")
     assert done.code == 1
     assert done.err.splitlines()[-1] == (
-        "hudepth-train: data.root: 'nowhere' does not exist. Pass data.root=<folder with index.csv>, or run with data=rooms."
+        "hudepth-train: data.root: 'nowhere' does not exist. "
+        "Pass data.root=<folder with index.csv>, or run with data=rooms."
     )
 
 

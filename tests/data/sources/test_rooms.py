@@ -299,7 +299,8 @@ def test_a_bad_size_says_what_to_do(size: Any) -> None:
     with pytest.raises(ConfigError) as caught:
         RoomsSource(size=size)
     assert str(caught.value) == (
-        f"data.source.size: got {size!r}. Pass [height, width], two whole numbers from 16 to 2048, for example [240, 320]."
+        f"data.source.size: got {size!r}. Pass [height, width], two whole numbers from 16 to 2048, "
+        "for example [240, 320]."
     )
 
 
