@@ -81,7 +81,8 @@ def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
     if datamodule.split.sha256 != checkpoint.split.get("sha256"):
         raise DataError(
             f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so "
-            "test pairs may have been trained on. Pass the data.root it was trained on, or data=<name> to test on other data."
+            "test pairs may have been trained on. "
+            "Pass the data.root it was trained on, or data=<name> to test on other data."
         )
 
 

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -35,10 +34,11 @@ from hudepth.checkpoint import AtomicCheckpointIO, load_checkpoint
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
-from hudepth.errors import CheckpointError, ConfigError, HudepthError
+from hudepth.errors import ConfigError, HudepthError
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
 from hudepth.tasks.common import build_data, build_protocols, plain, without_known_warnings
+from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.test import score_checkpoint
 
 RUN_ENV = "HUDEPTH_RUN"
@@ -98,37 +98,6 @@ def _run_path(config: dict[str, Any]) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         return path.resolve()
     return run_dir.create(config["paths"]["runs"], str(config["name"]))
-
-
-def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
-    """Return the configuration of a run to continue, with what was typed beside ``resume=`` on top.
-
-    Args:
-        path: the run directory.
-        overrides: as typed, for example ``["resume=runs/x", "trainer.max_epochs=50"]``.
-
-    Raises:
-        CheckpointError: if it is no run, or has no checkpoint to continue from.
-        ConfigError: if something typed is not a value of that run's configuration.
-    """
-    config = run_dir.read_config(path)
-    if not (path / run_dir.CHECKPOINTS / run_dir.LAST).is_file():
-        raise CheckpointError(f"resume: '{path}' has no finished epoch to continue from. Train anew, without resume=.")
-    resumed = OmegaConf.create(config)
-    for override in overrides:
-        key, _, value = override.partition("=")
-        key = key.lstrip("+")
-        if key in ("resume", "paths.runs"):
-            continue
-        if OmegaConf.select(resumed, key, default=resumed) is resumed or OmegaConf.is_dict(
-            OmegaConf.select(resumed, key)
-        ):
-            raise ConfigError(
-                f"resume: '{override}' cannot be changed when a run is continued; only values that its config.yaml "
-                "has can, such as trainer.max_epochs. Start a new run for anything else."
-            )
-        OmegaConf.update(resumed, key, yaml.safe_load(value))
-    return plain(resumed)
 
 
 def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
