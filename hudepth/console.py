@@ -19,9 +19,16 @@ console = Console(stderr=True)
 log = logging.getLogger("hudepth")
 
 
+class _CurrentStderr(logging.Handler):
+    """Writes to what is standard error when a line comes: a progress bar puts its own in place, to stay below lines."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
 def setup_logging() -> None:
-    """Send hudepth's log lines to what is standard error now, and nowhere else."""
-    log.handlers[:] = [logging.StreamHandler(sys.stderr)]
+    """Send hudepth's log lines to standard error, and nowhere else."""
+    log.handlers[:] = [_CurrentStderr()]
     log.setLevel(logging.INFO)
     log.propagate = False
 

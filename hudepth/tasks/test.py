@@ -29,6 +29,8 @@ from hudepth.tasks.common import build_data, build_protocols, plain, without_kno
 from hudepth.viz.panels import save_panels
 
 SHOWN = ("abs_rel", "sq_rel", "rmse", "rmse_log", "log10", "silog", "mae", "ssim", "delta1", "delta2", "delta3")
+NARROW = ("abs_rel", "rmse", "log10", "ssim", "delta1", "delta2", "delta3")
+"""Columns of the printed table, in a terminal wide enough for all and in others; metrics.json always has all."""
 MODEL = "model"
 
 
@@ -188,19 +190,20 @@ def _write_per_image(path: Path, protocol: Protocol, sums: Any, store: DepthStor
 
 def print_table(metrics: dict[str, dict[str, float]], *, title: str) -> None:
     """Print metrics to standard output, a row a predictor, the best of each column bold."""
+    out = Console()
+    if not out.is_terminal:
+        out = Console(width=130)  # a log should not wrap what a wide terminal would show
+    names = SHOWN if out.width >= 118 else NARROW
     table = Table(title=title, caption="rmse and mae in metres; delta and ssim: higher is better", title_justify="left")
     table.add_column("")
-    for name in SHOWN:
+    for name in names:
         table.add_column(name, justify="right", no_wrap=True)
     for who, row in metrics.items():
         cells = []
-        for name in SHOWN:
+        for name in names:
             column = [other[name] for other in metrics.values()]
             best = max(column) if name in ("ssim", "delta1", "delta2", "delta3") else min(column)
             text = f"{row[name]:.3f}" if row[name] < 100 else f"{row[name]:.1f}"
             cells.append(f"[bold]{text}[/]" if row[name] == best and len(metrics) > 1 else text)
         table.add_row(who.replace("_", " "), *cells)
-    out = Console()
-    if not out.is_terminal:
-        out = Console(width=130)  # a log should not wrap what a wide terminal would show
     out.print(table)
