@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 
@@ -25,3 +26,11 @@ def nyu_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no NYU frames in '{root}'; set HUDEPTH_NYU_ROOT to where they are")
     return root
+
+
+@pytest.fixture(autouse=True)
+def _own_logging(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Undo what a console script run in this process does to the log: other tests would see its lines twice."""
+    log = logging.getLogger("hudepth")
+    monkeypatch.setattr(log, "handlers", list(log.handlers))
+    monkeypatch.setattr(log, "propagate", log.propagate)
