@@ -105,7 +105,7 @@ def score_checkpoint(
     Raises:
         HudepthError: with one line for the user.
     """
-    protocols = build_protocols(config["protocol"], trust=config["trust"])
+    protocols = build_protocols(config["protocol"], datamodule=datamodule, trust=config["trust"])
     store, split = datamodule.store, datamodule.split
     predictors: dict[str, nn.Module] = {MODEL: checkpoint.build_net(trust=config["trust"])}
     if config.get("baselines", True):

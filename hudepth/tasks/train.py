@@ -140,7 +140,8 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
     datamodule = build_data(config["data"], trust=trust)
     if datamodule.source.name == "rooms":
         log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
-    build_protocols(config["protocol"], trust=trust)  # a wrong protocol should not be found after hours
+    if config["test"]:  # a wrong protocol should not be found after hours
+        build_protocols(config["protocol"], datamodule=datamodule, trust=trust)
     split_file = path / "split.json"
     if resume and split_file.exists():
         datamodule.split = load_split(split_file, datamodule.store.records)

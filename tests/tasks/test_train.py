@@ -131,6 +131,16 @@ def test_a_size_the_network_cannot_take_gives_the_nearest(command: Command) -> N
     assert done.err.splitlines()[-1].endswith("Pass data.size=[32,48] or [48,48].")
 
 
+def test_a_protocol_that_needs_what_is_not_prepared_is_refused_before_training(command: Command) -> None:
+    done = command("train", *TINY, "data.native=false")
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        "hudepth-train: protocol=eigen scores at native resolution, which data.native=false leaves out. "
+        "Pass data.native=true, or protocol=paper."
+    )
+    assert "epoch 1" not in done.err
+
+
 def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
     done = command(
         "train", *TINY, "name=stop", "callbacks=early_stopping", "callbacks.panels=0", "schedule=cosine", "test=false",
