@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import signal
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -110,6 +112,45 @@ class EpochLine(Callback):
         ]
         ending = f"{duration(each)} an epoch" + (f", {duration(each * left)} left" if left else "")
         log.info("epoch %d of %s: %s (%s)", trainer.current_epoch + 1, trainer.max_epochs, ", ".join(values), ending)
+
+
+class Interrupt(Callback):
+    """Lets Ctrl-C end a run between two batches; pressed again, at once.
+
+    Raised wherever Python happens to be, a KeyboardInterrupt can be lost: in the callback of a weak reference, of which
+    drawing has many, it is printed and ignored, and training goes on.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: Any = None
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Take the signal, where a thread may."""
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._ask)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give it back."""
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+            self._before = None
+
+    def _ask(self, number: int, frame: Any) -> None:
+        if self._asked:
+            raise KeyboardInterrupt
+        self._asked = True
+        log.info("stopping after this batch; Ctrl-C again stops at once")
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Stop here, if asked to."""
+        if self._asked:
+            raise KeyboardInterrupt
+
+    def on_validation_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Stop here, if asked to."""
+        if self._asked:
+            raise KeyboardInterrupt
 
 
 class PanelPictures(Callback):

@@ -3,6 +3,9 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import os
+import signal
+import weakref
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -18,7 +21,15 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hudepth import callbacks
-from hudepth.callbacks import EpochLine, History, PanelPictures, checkpoint_callbacks, evenly_spaced, make_panels
+from hudepth.callbacks import (
+    EpochLine,
+    History,
+    Interrupt,
+    PanelPictures,
+    checkpoint_callbacks,
+    evenly_spaced,
+    make_panels,
+)
 from hudepth.checkpoint import AtomicCheckpointIO, read_plain
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
@@ -162,6 +173,35 @@ def test_epoch_line(data: DepthDataModule, tmp_path: Path, caplog: pytest.LogCap
 
 def test_the_monitored_metric_is_shown_once() -> None:
     assert EpochLine("val/rmse").shown == ("val/rmse", "val/abs_rel", "val/delta1")
+
+
+# --- Ctrl-C ---
+
+
+class PressesCtrlC(Callback):
+    """Sends the signal where a KeyboardInterrupt would be lost, and counts what goes on after it."""
+
+    def __init__(self) -> None:
+        self.batches = 0
+
+    def on_train_batch_start(self, *_: object) -> None:
+        self.batches += 1
+        dying = {object.__new__(type("Dying", (), {}))}
+        reference = weakref.ref(next(iter(dying)), lambda _: os.kill(os.getpid(), signal.SIGINT))
+        dying.clear()
+        assert reference() is None
+
+
+def test_ctrl_c_ends_training_wherever_it_hits(data: DepthDataModule, tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    presses = PressesCtrlC()
+    try:
+        with pytest.raises(SystemExit):
+            fit(data, tmp_path, [Interrupt(), presses], max_epochs=2)
+        assert presses.batches == 1
+        assert signal.getsignal(signal.SIGINT) == before
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------

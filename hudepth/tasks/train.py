@@ -25,6 +25,7 @@ from hudepth import run_dir
 from hudepth.callbacks import (
     EpochLine,
     History,
+    Interrupt,
     PanelPictures,
     checkpoint_callbacks,
     evenly_spaced,
@@ -197,7 +198,7 @@ def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: 
 def _callbacks(config: dict[str, Any], path: Path, datamodule: DepthDataModule) -> list[Callback]:
     options = config["callbacks"]
     monitor, mode = config["monitor"], config["mode"]
-    callbacks: list[Callback] = [History(path / "metrics.csv"), EpochLine(monitor)]
+    callbacks: list[Callback] = [Interrupt(), History(path / "metrics.csv"), EpochLine(monitor)]
     if options["panels"]:
         callbacks.append(
             PanelPictures(
