@@ -136,6 +136,10 @@ class Interrupt(Callback):
             signal.signal(signal.SIGINT, self._before)
             self._before = None
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Give it back too: after an exception there is no teardown."""
+        self.teardown(trainer, pl_module, "fit")
+
     def _ask(self, number: int, frame: Any) -> None:
         if self._asked:
             raise KeyboardInterrupt
