@@ -125,20 +125,20 @@ class Interrupt(Callback):
         self._asked = False
         self._before: Any = None
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Take the signal, where a thread may."""
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the signal, where a thread may: later than Lightning, which gives back what it found."""
         if threading.current_thread() is threading.main_thread():
             self._before = signal.signal(signal.SIGINT, self._ask)
 
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Give it back."""
         if self._before is not None:
             signal.signal(signal.SIGINT, self._before)
             self._before = None
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Give it back too: after an exception there is no teardown."""
-        self.teardown(trainer, pl_module, "fit")
+        """Give it back."""
+        self.on_train_end(trainer, pl_module)
 
     def _ask(self, number: int, frame: Any) -> None:
         if self._asked:

@@ -192,6 +192,12 @@ class PressesCtrlC(Callback):
         assert reference() is None
 
 
+def test_ctrl_c_is_as_it_was_after_training(data: DepthDataModule, tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    fit(data, tmp_path, [Interrupt()], max_epochs=1)
+    assert signal.getsignal(signal.SIGINT) == before
+
+
 def test_ctrl_c_ends_training_wherever_it_hits(data: DepthDataModule, tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGINT)
     presses = PressesCtrlC()
