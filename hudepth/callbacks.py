@@ -220,6 +220,20 @@ def evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
     return [indices[i * len(indices) // count] for i in range(count)]
 
 
+class KeptCheckpoint(ModelCheckpoint):
+    """A ModelCheckpoint that still knows the best so far when the run directory was moved before it went on."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the state from a checkpoint, with the paths of where the run lies now."""
+
+        def here(path: str) -> str:
+            return str(Path(str(self.dirpath)) / Path(path).name) if path else path
+
+        moved = {key: here(state_dict[key]) for key in ("best_model_path", "kth_best_model_path", "last_model_path")}
+        best = {here(path): score for path, score in state_dict["best_k_models"].items()}
+        super().load_state_dict({**state_dict, **moved, "best_k_models": best, "dirpath": self.dirpath})
+
+
 def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelCheckpoint]:
     """Return the callbacks that keep the best weights and the last state.
 
@@ -232,11 +246,11 @@ def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelChe
         mode: ``min`` or ``max``.
     """
     folder = run / run_dir.CHECKPOINTS
-    best = ModelCheckpoint(
+    best = KeptCheckpoint(
         folder, filename=Path(run_dir.BEST).stem, monitor=monitor, mode=mode, save_weights_only=True,
         save_on_train_epoch_end=True, enable_version_counter=False, auto_insert_metric_name=False,
     )  # fmt: skip
-    last = ModelCheckpoint(
+    last = KeptCheckpoint(
         folder, filename=Path(run_dir.LAST).stem, save_on_train_epoch_end=True, enable_version_counter=False
     )
     return [best, last]

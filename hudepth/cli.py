@@ -82,6 +82,10 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
             got = f" no verb '{words[0]}'.{did_you_mean(words[0], DATA_VERBS)}" if words else " a verb is missing."
             raise ConfigError(f"{got.strip()} Type hudepth-data prepare or hudepth-data info.")
         result = [f"verb={a}" if a == verbs[0] else a for a in result]
+    flags = [a for a in result if a in ("-m", "--multirun")]
+    result = [*flags, *(a for a in result if a not in flags)]  # between overrides argparse would stumble over them
+    if any(a.startswith("resume=") for a in result):  # the keys are those of the run, which Hydra does not know
+        result = [f"++{a}" if "." in a.partition("=")[0] and a[0] not in "+~" else a for a in result]
     if task == "test" and not any(a.startswith(("data=", "+data=")) for a in result):
         result = [f"++{a}" if a.startswith("data.") else a for a in result]
     return result
@@ -155,7 +159,12 @@ def _config_line(error: BaseException, task: str) -> str | None:
             return f"{group}: no '{name}'.{did_you_mean(name, options)} Pass one of {', '.join(options)}."
     if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
         key = found[1] or getattr(error, "full_key", None) or found[2]
-        return f"no key '{key}'.{did_you_mean(key, known_keys(task))} See hudepth-{task} --cfg job for all keys."
+        plus = (
+            f" Further arguments of lightning.Trainer take a plus: +{key}=<value>."
+            if key.startswith("trainer.")
+            else ""
+        )
+        return f"no key '{key}'.{did_you_mean(key, known_keys(task))} See hudepth-{task} --cfg job for all keys.{plus}"
     if "Override" in type(error).__name__ or module == "antlr4" or "NoViableAlt" in text:
         typed = getattr(error, "override", None) or text.split(": ", 1)[-1]
         return f"cannot read '{typed}': write key=value, and quote values with special characters: 'key=\"a, b\"'."

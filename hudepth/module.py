@@ -17,6 +17,7 @@ from torchmetrics import MetricCollection
 from hudepth import checkpoint as ckpt
 from hudepth.errors import TrainingError
 from hudepth.metrics.collection import DepthMetrics, DepthSSIM
+from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.types import Batch
 
 
@@ -70,6 +71,13 @@ class DepthModule(LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Log the loss of a batch and add it to the metrics."""
         self._step(batch, "val")
+
+    @torch.inference_mode()
+    def logged_names(self) -> list[str]:
+        """Return the names of all that is logged for an epoch; the loss is asked for its terms."""
+        depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
+        terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
+        return [*(f"val/{name}" for name in (*METRIC_NAMES, "ssim", *terms)), *(f"train/{name}" for name in terms)]
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         pred = self(batch["image"])

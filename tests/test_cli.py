@@ -106,6 +106,8 @@ def test_tab_completion(tmp_path: Path) -> None:
     [
         ("train", ["experiment=x", "a.b=1"], ["+experiment=x", "a.b=1"]),
         ("train", ["+experiment=x", "sweep=y"], ["+experiment=x", "+sweep=y"]),
+        ("train", ["loss=l1,l2", "-m", "seed=1"], ["-m", "loss=l1,l2", "seed=1"]),
+        ("train", ["resume=x", "trainer.max_epochs=5"], ["resume=x", "++trainer.max_epochs=5"]),
         ("data", ["prepare", "data=rooms"], ["verb=prepare", "data=rooms"]),
         ("data", ["data=rooms", "info"], ["data=rooms", "verb=info"]),
         ("test", ["checkpoint=x", "data.root=y"], ["checkpoint=x", "++data.root=y"]),

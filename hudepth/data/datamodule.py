@@ -61,8 +61,8 @@ class DepthDataModule(LightningDataModule):
         prepare_workers: int | None = None,
     ) -> None:
         super().__init__()
-        if len(size) != 2 or min(size) < 1:
-            raise ConfigError(f"data.size: {list(size)} is not [height,width]. Pass data.size=[224,224].")
+        if not isinstance(size, Sequence) or len(size) != 2 or min(size) < 1:
+            raise ConfigError(f"data.size: {size} is not [height,width]. Pass data.size=[224,224].")
         check_split(split, fractions)
         for key, value, least in (
             ("batch_size", batch_size, 1),

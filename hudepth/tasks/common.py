@@ -53,6 +53,8 @@ def build_data(data: Mapping[str, Any], *, trust: list[str]) -> DepthDataModule:
     Raises:
         ConfigError: if it cannot be built.
     """
+    if not isinstance(data.get("source"), Mapping):
+        raise ConfigError("data.source: none is given. Choose a data set with data=<name>.")
     given = {key: data[key] for key in SOURCE_KEYS if key in data}
     source = instantiate(data["source"], trust=trust, only=Source, **given)
     options = {key: value for key, value in data.items() if key not in (*SOURCE_KEYS, "source")}

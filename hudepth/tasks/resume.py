@@ -8,12 +8,37 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from hudepth import run_dir
+from hudepth.checkpoint import read_plain
 from hudepth.errors import CheckpointError, ConfigError
 from hudepth.tasks.common import plain
+
+CHANGEABLE = (
+    "trainer.", "callbacks.", "logger.", "data.root", "data.num_workers", "data.prepare_workers", "paths.",
+    "test", "trust",
+)  # fmt: skip
+"""What may differ when a run goes on. All else is in its checkpoint or its split and would only seem to change."""
+
+PARTS = (
+    "seed",
+    "monitor",
+    "mode",
+    "data",
+    "model",
+    "loss",
+    "optim",
+    "schedule",
+    "trainer",
+    "callbacks",
+    "logger",
+    "protocol",
+)
+"""What the configuration of a run has."""
 
 
 def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
     """Return the configuration of a run to continue, with what was typed beside ``resume=`` on top.
+
+    The run directory may be a stranger's, so it does not vouch for its own classes: only a typed ``trust=`` counts.
 
     Args:
         path: the run directory.
@@ -21,22 +46,34 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
 
     Raises:
         CheckpointError: if it is no run, or has no checkpoint to continue from.
-        ConfigError: if something typed is not a value of that run's configuration.
+        ConfigError: if something typed cannot change any more.
     """
     config = run_dir.read_config(path)
-    if not (path / run_dir.CHECKPOINTS / run_dir.LAST).is_file():
+    lacking = [part for part in PARTS if part not in config]
+    if lacking:
+        raise CheckpointError(f"resume: '{path}' is no run of hudepth-train: its config.yaml has no '{lacking[0]}'.")
+    last = path / run_dir.CHECKPOINTS / run_dir.LAST
+    if not last.is_file():
         raise CheckpointError(f"resume: '{path}' has no finished epoch to continue from. Train anew, without resume=.")
-    resumed = OmegaConf.create(config)
+    read_plain(last)
+    epochs = config["trainer"].get("max_epochs")
+    resumed = OmegaConf.create({**config, "trust": []})
     for override in overrides:
         key, _, value = override.partition("=")
         key = key.lstrip("+")
-        if key in ("resume", "paths.runs"):
+        if key == "resume":
             continue
         found = OmegaConf.select(resumed, key, default=resumed)
-        if found is resumed or OmegaConf.is_dict(found):
+        if not key.startswith(CHANGEABLE) or OmegaConf.is_dict(found) or (found is resumed and key.count(".") != 1):
             raise ConfigError(
-                f"resume: '{override}' cannot be changed when a run is continued; only values that its config.yaml "
-                "has can, such as trainer.max_epochs. Start a new run for anything else."
+                f"resume: '{override}' cannot be changed when a run is continued; trainer.max_epochs and other "
+                "values of trainer, callbacks and logger can. Start a new run for anything else."
             )
-        OmegaConf.update(resumed, key, OmegaConf.from_dotlist([f"value={value}"])["value"])
-    return plain(resumed)
+        OmegaConf.update(resumed, key, OmegaConf.from_dotlist([f"value={value}"])["value"], force_add=True)
+    result = plain(resumed)
+    if "T_max" in (config["schedule"] or {}) and result["trainer"].get("max_epochs") != epochs:
+        raise ConfigError(
+            f"resume: the cosine schedule of this run ends at epoch {config['schedule']['T_max']}, so "
+            "trainer.max_epochs cannot change. Start a new run, or use schedule=constant."
+        )
+    return result

@@ -8,9 +8,10 @@ import math
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import RichProgressBar
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 from torch import nn
@@ -19,9 +20,9 @@ from hudepth.callbacks import evenly_spaced, make_panels, shows_progress
 from hudepth.checkpoint import Checkpoint, load_checkpoint
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
-from hudepth.data.splits import load_split
+from hudepth.data.splits import Split, load_split, make_split
 from hudepth.data.store import DepthStore
-from hudepth.errors import ConfigError, DataError, did_you_mean
+from hudepth.errors import CheckpointError, ConfigError, DataError, did_you_mean
 from hudepth.evaluation import Evaluation, trivial_baselines
 from hudepth.files import write_json, write_text
 from hudepth.metrics.protocol import Protocol
@@ -46,11 +47,14 @@ def test(cfg: DictConfig) -> None:
     config = plain(cfg)
     checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
     # The checkpoint may be a stranger's: it says what to read, but not where to write.
-    own = {"cache": config["paths"]["cache"]}
-    config["data"], other_data = _data_config(checkpoint, {**own, **(config.get("data") or {})})
+    typed = {"cache": config["paths"]["cache"], **(config.get("data") or {})}
+    config["data"] = _data_config(checkpoint, typed, list(HydraConfig.get().overrides.task))
     log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data.get("source"))
     datamodule = build_data(config["data"], trust=config["trust"])
-    if not other_data:
+    other_data = "_target_" in typed or any(key.startswith(("split", "fractions")) for key in typed)
+    if other_data:
+        _refuse_training_pairs(checkpoint, datamodule)
+    else:
         _restore_split(checkpoint, datamodule)
     output = config["output"] or (checkpoint.run / "test" if checkpoint.run else f"test_{checkpoint.path.stem}")
     if config["output"] is None and other_data and checkpoint.run:
@@ -58,26 +62,45 @@ def test(cfg: DictConfig) -> None:
     score_checkpoint(checkpoint, config=config, output=Path(output), datamodule=datamodule)
 
 
-def _data_config(checkpoint: Checkpoint, typed: dict[str, Any]) -> tuple[dict[str, Any], bool]:
-    """Return the data configuration to test on, and whether it is another set than the checkpoint's."""
-    trained = checkpoint.config["data"]
+def _data_config(checkpoint: Checkpoint, typed: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
+    """Return the data configuration to test on: the checkpoint's with what was typed, or another set's.
+
+    A network keeps the input size it was trained at, unless another is typed, and the scale of its output in any case.
+    """
+    trained = checkpoint.config.get("data")
+    if not isinstance(trained, dict):
+        raise CheckpointError(f"'{checkpoint.path}' does not say what data it was trained on.")
     if "_target_" in typed:
-        return typed, True
-    unknown = [key for key in typed if key not in trained]
-    if unknown:
+        keys = {override.lstrip("+").partition("=")[0] for override in overrides}
+        data = {**typed, **{k: trained[k] for k in ("size", "max_depth_m") if k in trained and f"data.{k}" not in keys}}
+    else:
+        unknown = [key for key in typed if key not in trained]
+        if unknown:
+            raise ConfigError(
+                f"data.{unknown[0]}: the checkpoint's data has no such key.{did_you_mean(unknown[0], trained)} "
+                "To test on another data set pass data=<name>."
+            )
+        source = {**trained.get("source", {}), **typed.get("source", {})}
+        data = {**trained, **typed, "source": source}
+    if data.get("max_depth_m") != trained.get("max_depth_m"):
         raise ConfigError(
-            f"data.{unknown[0]}: the checkpoint's data has no such key.{did_you_mean(unknown[0], trained)} "
-            "To test on another data set pass data=<name>."
+            f"data.max_depth_m: the network was trained for {trained.get('max_depth_m')} m and answers in shares of "
+            f"it, not of {data.get('max_depth_m')} m. Leave data.max_depth_m out."
         )
-    merged = OmegaConf.to_container(OmegaConf.merge(OmegaConf.create(trained), OmegaConf.create(typed)))
-    assert isinstance(merged, dict)
-    return {str(key): value for key, value in merged.items()}, any(key.startswith("split") for key in typed)
+    return data
+
+
+def _recorded_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | None:
+    """Return the split of the training run from its split.json, if the checkpoint still lies beside it."""
+    file = checkpoint.run / "split.json" if checkpoint.run else None
+    return load_split(file, datamodule.store.records) if file and file.is_file() else None
 
 
 def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
     """Use the very split of the training run: from its split.json, else made again and compared by hash."""
-    if checkpoint.run and (checkpoint.run / "split.json").is_file():
-        datamodule.split = load_split(checkpoint.run / "split.json", datamodule.store.records)
+    recorded = _recorded_split(checkpoint, datamodule)
+    if recorded:
+        datamodule.split = recorded
     if datamodule.store.info["fingerprint"] != checkpoint.data.get("fingerprint"):
         log.warning("the files of %s have changed since the checkpoint was trained", datamodule.source.name)
     if datamodule.split.sha256 != checkpoint.split.get("sha256"):
@@ -85,6 +108,22 @@ def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
             f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so "
             "test pairs may have been trained on. "
             "Pass the data.root it was trained on, or data=<name> to test on other data."
+        )
+
+
+def _refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
+    """Refuse to test on pairs the network was trained on, where the data is the very set of its training."""
+    if datamodule.store.info["fingerprint"] != checkpoint.data.get("fingerprint"):
+        return
+    split = checkpoint.split
+    trained = _recorded_split(checkpoint, datamodule) or make_split(
+        datamodule.store.records, kind=split["kind"], seed=split["seed"], fractions=split["fractions"]
+    )
+    shared = set(trained.train) & set(datamodule.split.test)
+    if shared:
+        raise DataError(
+            f"data.split={datamodule.split.kind}: {len(shared)} of {len(datamodule.split.test)} test pairs were "
+            f"trained on, under data.split={trained.kind}. Leave data.split out to test on what was held out."
         )
 
 
@@ -106,6 +145,10 @@ def score_checkpoint(
         HudepthError: with one line for the user.
     """
     protocols = build_protocols(config["protocol"], datamodule=datamodule, trust=config["trust"])
+    try:
+        output.mkdir(parents=True, exist_ok=True)  # not after the work is done
+    except OSError as error:
+        raise ConfigError(f"output: cannot make '{output}' ({error.strerror}). Pass output=<a folder>.") from error
     store, split = datamodule.store, datamodule.split
     predictors: dict[str, nn.Module] = {MODEL: checkpoint.build_net(trust=config["trust"])}
     if config.get("baselines", True):
@@ -123,14 +166,14 @@ def score_checkpoint(
         metrics = {name: protocol.summary(rows) for name, rows in sums.items()}
         results[protocol.name] = metrics
         if trainer.is_global_zero:
+            print_table(
+                metrics, title=f"{protocol.name} protocol, {len(indices)} test images of {datamodule.source.name}"
+            )
             write_json(
                 folder / "metrics.json",
                 {"metrics": _finite(metrics), "images": len(indices), "protocol": protocol.stamp(), **shared},
             )
             _write_per_image(folder / "per_image.csv", protocol, sums[MODEL], store, indices)
-            print_table(
-                metrics, title=f"{protocol.name} protocol, {len(indices)} test images of {datamodule.source.name}"
-            )
     count = config.get("panels", 6)
     if count and trainer.is_global_zero:
         shown = evenly_spaced(sorted(indices), count)

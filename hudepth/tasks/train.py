@@ -38,6 +38,7 @@ from hudepth.data.splits import load_split, save_split
 from hudepth.errors import ConfigError, HudepthError
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
+from hudepth.tasks.checks import check_config, check_input, check_monitor
 from hudepth.tasks.common import build_data, build_protocols, plain, without_known_warnings
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.test import score_checkpoint
@@ -58,14 +59,14 @@ def train(cfg: DictConfig) -> float | None:
     Raises:
         HudepthError: with one line for the user; the run's status and log say the same.
     """
-    overrides = list(HydraConfig.get().overrides.task)
+    overrides = [typed.removeprefix("++") for typed in HydraConfig.get().overrides.task]
     if cfg.resume:
         path = Path(cfg.resume).expanduser().resolve()
         config = resumed_config(path, overrides)
-        if _first_process():
-            run_dir.write_resumed(path, config=config, overrides=overrides)
+        check_config(config)
     else:
         config = plain(cfg)
+        check_config(config)
         path = _run_path(config)
         if _first_process():
             environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
@@ -75,7 +76,7 @@ def train(cfg: DictConfig) -> float | None:
     os.environ[RUN_ENV] = str(path)
     try:
         with run_dir.logged_to(path / "train.log"):
-            return _run(config, path, resume=bool(cfg.resume))
+            return _run(config, path, resumed=overrides if cfg.resume else None)
     finally:
         os.environ.pop(RUN_ENV, None)
 
@@ -101,11 +102,11 @@ def _run_path(config: dict[str, Any]) -> Path:
     return run_dir.create(config["paths"]["runs"], str(config["name"]))
 
 
-def _run(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
+def _run(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> float | None:
     """Fit and test inside a run directory, whose status always tells how it went."""
     try:
         _status(path, "running")
-        best = _fit(config, path, resume=resume)
+        best = _fit(config, path, resumed=resumed)
     except HudepthError as error:
         _failed(path, str(error))
         raise
@@ -134,7 +135,7 @@ def _failed(path: Path, message: str) -> None:
         log.warning("the status in '%s' could not be written", path)
 
 
-def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
+def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> float | None:
     log.info("run directory: %s", path)
     seed_everything(config["seed"], verbose=False)
     trust = list(config["trust"])
@@ -143,12 +144,15 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
     if config["test"]:  # a wrong protocol should not be found after hours
         build_protocols(config["protocol"], datamodule=datamodule, trust=trust)
+    net = instantiate(config["model"], trust=trust, only=nn.Module)
+    check_input(net, datamodule.size)
     split_file = path / "split.json"
-    if resume and split_file.exists():
+    if resumed is not None and split_file.exists():
         datamodule.split = load_split(split_file, datamodule.store.records)
     elif _first_process():
         save_split(split_file, datamodule.split, datamodule.store.records)
-    module = build_module(config, datamodule, trust=trust)
+    module = build_module(config, net, datamodule, trust=trust)
+    check_monitor(config["monitor"], module)
     callbacks = _callbacks(config, path, datamodule)
     with without_known_warnings():
         trainer = _trainer(config, path, callbacks)
@@ -159,9 +163,13 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
         datamodule.batch_size, type(trainer.accelerator).__name__.removesuffix("Accelerator"),
         torch.get_num_threads(),
     )  # fmt: skip
-    last = path / run_dir.CHECKPOINTS / run_dir.LAST
+    last = None
+    if resumed is not None:
+        last = path / run_dir.CHECKPOINTS / run_dir.LAST
+        if _first_process():
+            run_dir.write_resumed(path, config=config, overrides=resumed)
     with without_known_warnings():
-        trainer.fit(module, datamodule=datamodule, ckpt_path=last if resume else None, weights_only=True)
+        trainer.fit(module, datamodule=datamodule, ckpt_path=last, weights_only=True)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
     score = best.best_model_score
     if torch.distributed.is_initialized():
@@ -173,8 +181,10 @@ def _fit(config: dict[str, Any], path: Path, *, resume: bool) -> float | None:
     return None if score is None else float(score)
 
 
-def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: list[str]) -> DepthModule:
-    """Build network, loss, optimiser and schedule of a configuration into a module.
+def build_module(
+    config: dict[str, Any], net: nn.Module, datamodule: DepthDataModule, *, trust: list[str]
+) -> DepthModule:
+    """Build loss, optimiser and schedule of a configuration around a network.
 
     Raises:
         HudepthError: if a part cannot be built.
@@ -182,7 +192,7 @@ def build_module(config: dict[str, Any], datamodule: DepthDataModule, *, trust: 
     schedule = config["schedule"]
     scheduled = schedule and schedule.get("_target_")
     return DepthModule(
-        instantiate(config["model"], trust=trust, only=nn.Module),
+        net,
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
         optimizer=partial(instantiate, config["optim"], trust=trust, only=Optimizer),

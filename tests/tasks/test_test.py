@@ -148,3 +148,26 @@ def test_a_checkpoint_does_not_say_where_to_write(command: Command, trained: Pat
     torch.save(content, tmp_path / "stranger.ckpt")
     assert command("test", "checkpoint=stranger.ckpt").code == 0
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_other_data_keeps_the_networks_size_and_scale(command: Command, trained: Path, tmp_path: Path) -> None:
+    source = [a for a in TINY if a.startswith("data.source")]
+    done = command("test", f"checkpoint={trained}", "data=rooms", *source, "data.source.seed=5", "output=scores")
+    assert done.code == 0, done.err
+    assert metrics(tmp_path / "scores" / "paper")["network_size"] == [32, 48]
+    done = command("test", f"checkpoint={trained}", "data.max_depth_m=5")
+    assert done.code == 1
+    assert "data.max_depth_m: the network was trained for 10.0 m" in done.err.splitlines()[-1]
+
+
+def test_training_pairs_are_not_tested_on(command: Command, trained: Path) -> None:
+    done = command("test", f"checkpoint={trained}", "data.split=random", "output=scores")
+    assert done.code == 1
+    assert "test pairs were trained on, under data.split=official." in done.err.splitlines()[-1]
+
+
+def test_an_output_in_the_way_is_found_before_the_work(command: Command, trained: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    done = command("test", f"checkpoint={trained}", "output=taken")
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith("hudepth-test: output: cannot make 'taken' (File exists).")

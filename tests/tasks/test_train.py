@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -152,9 +153,20 @@ def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
 
 def test_resume_refuses_what_it_cannot_do(command: Command, trained: Path, tmp_path: Path) -> None:
     assert "is no run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
-    (tmp_path / "config.yaml").write_text("a: 1\n")
-    done = command("train", f"resume={tmp_path}")
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "config.yaml").write_text("a: 1\n")
+    done = command("train", f"resume={foreign}")
+    assert done.err.splitlines()[-1].endswith("is no run of hudepth-train: its config.yaml has no 'seed'.")
+    assert [path.name for path in foreign.iterdir()] == ["config.yaml"]
+    (foreign / "config.yaml").write_bytes((trained / "config.yaml").read_bytes())
+    done = command("train", f"resume={foreign}")
     assert done.err.splitlines()[-1].endswith("has no finished epoch to continue from. Train anew, without resume=.")
+    for override in ("optim.lr=1e-1", "data.split=random", "loss.boundary=1", "model.width=3", "seed=3"):
+        done = command("train", f"resume={trained}", override)
+        assert done.code == 1
+        assert f"resume: '{override}' cannot be changed when a run is continued" in done.err.replace("++", "")
+    assert yaml.safe_load((trained / "config.yaml").read_text())["optim"]["lr"] == 1e-4
     done = command("train", f"resume={trained}", "loss=l1")
     assert done.code == 1
     assert "resume: 'loss=l1' cannot be changed when a run is continued" in done.err.splitlines()[-1]
@@ -275,3 +287,54 @@ def test_two_processes_train_into_one_run_directory(tmp_path: Path, cache: Path)
     assert [row["step"] for row in history(run)] == ["2", "4"]  # 8 pairs, two at a time in each of two processes
     assert (run / "test" / "eigen" / "metrics.json").is_file()
     assert done.stdout.count("epoch 2 of 2") == 1
+
+
+def test_a_run_directory_does_not_vouch_for_its_own_classes(command: Command, trained: Path, tmp_path: Path) -> None:
+    stranger = tmp_path / "stranger"
+    shutil.copytree(trained, stranger)
+    config = yaml.safe_load((stranger / "config.yaml").read_text())
+    config["trust"] = ["subprocess"]
+    config["model"] = {"_target_": "subprocess.Popen", "args": ["touch", str(tmp_path / "ran")]}
+    (stranger / "config.yaml").write_text(yaml.safe_dump(config))
+    done = command("train", f"resume={stranger}", "trainer.max_epochs=3")
+    assert done.code == 1
+    assert "_target_: 'subprocess.Popen' is not under a trusted module" in done.err
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_moved_run_keeps_its_best_when_it_goes_on(command: Command, tmp_path: Path) -> None:
+    options = (*TINY, "test=false", "callbacks.panels=0", "logger=none", "monitor=train/total", "mode=max")
+    assert command("train", *options, "name=moving").code == 0  # mode=max: the first epoch is the best
+    run = only_run(tmp_path, "moving").rename(tmp_path / "moved")
+    best = (run / "checkpoints" / "best.ckpt").read_bytes()
+    assert read_plain(run / "checkpoints" / "best.ckpt")["epoch"] == 0
+    done = command("train", f"resume={run}", "trainer.max_epochs=3")
+    assert done.code == 0, done.err
+    assert (run / "checkpoints" / "best.ckpt").read_bytes() == best
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("monitor=val/abs_rell", "monitor: no 'val/abs_rell'. Did you mean 'val/abs_rel'?"),
+        ("mode=mni", "mode: no 'mni'. Pass min or max: which way monitor is better."),
+        ("seed=abc", "seed: 'abc' is not a whole number."),
+        ("name=../x", "name: '../x' cannot name a folder of runs."),
+        ("callbacks.panels_every_n_epochs=0", "callbacks.panels_every_n_epochs: 0 is less than 1."),
+        ("trainer.max_steps=3", "no key 'trainer.max_steps'. Did you mean 'trainer.max_epochs'? See hudepth-train"),
+    ],
+)
+def test_mistakes_are_found_before_any_work(override: str, message: str, command: Command, tmp_path: Path) -> None:
+    cache = "test=false" if "monitor" in override else f"paths.cache={tmp_path / 'empty'}"
+    done = command("train", *TINY, override, cache)
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith(f"hudepth-train: {message}")
+    assert not list(tmp_path.glob("empty/*.h5"))
+    assert "epoch 1" not in done.err
+
+
+def test_a_cosine_schedule_has_its_end(command: Command, tmp_path: Path) -> None:
+    assert command("train", *TINY, "name=cosine", "schedule=cosine", "test=false", "callbacks.panels=0").code == 0
+    done = command("train", f"resume={only_run(tmp_path, 'cosine')}", "trainer.max_epochs=4")
+    assert done.code == 1
+    assert "resume: the cosine schedule of this run ends at epoch 2" in done.err.splitlines()[-1]

@@ -1,0 +1,55 @@
+"""What is checked before a training begins: mistakes that would otherwise cost data preparation or an epoch."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import torch
+from torch import nn
+
+from hudepth.errors import ConfigError, did_you_mean
+from hudepth.module import DepthModule
+
+
+def check_config(config: dict[str, Any]) -> None:
+    """Check what no constructor checks in time, before anything is written.
+
+    Raises:
+        ConfigError: for values out of range.
+    """
+    if not isinstance(config["seed"], int):
+        raise ConfigError(f"seed: {config['seed']!r} is not a whole number.")
+    if config["mode"] not in ("min", "max"):
+        raise ConfigError(f"mode: no '{config['mode']}'. Pass min or max: which way monitor is better.")
+    name = config["name"]
+    if name is None or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", str(name)) or ".." in str(name).split("/"):
+        raise ConfigError(f"name: {name!r} cannot name a folder of runs. Use letters, digits, '.', '_' and '-'.")
+    every = config["callbacks"]["panels_every_n_epochs"]
+    if not isinstance(every, int) or every < 1:
+        raise ConfigError(
+            f"callbacks.panels_every_n_epochs: {every!r} is less than 1. Pass callbacks.panels=0 for none."
+        )
+
+
+@torch.inference_mode()
+def check_input(net: nn.Module, size: tuple[int, int]) -> None:
+    """Show the network one image of this size, before hours go into preparing others.
+
+    Raises:
+        HudepthError: the network's own, if it cannot take it.
+    """
+    net.eval()
+    net(torch.zeros(1, 3, *size))
+    net.train()
+
+
+def check_monitor(monitor: str, module: DepthModule) -> None:
+    """Check that ``monitor`` is something the module logs, before an epoch is lost over it.
+
+    Raises:
+        ConfigError: if it is not.
+    """
+    known = module.logged_names()
+    if monitor not in known:
+        raise ConfigError(f"monitor: no '{monitor}'.{did_you_mean(monitor, known)} Pass one of {', '.join(known)}.")
