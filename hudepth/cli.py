@@ -15,7 +15,8 @@ from hudepth.errors import ConfigError, HudepthError, did_you_mean
 ADDED_GROUPS = ("experiment", "sweep")
 """Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
 
-DATA_VERBS = ("prepare", "info")
+VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "figures", "paper")}
+"""The first word after the console scripts that can do several things."""
 
 
 def train() -> int:
@@ -31,6 +32,11 @@ def test() -> int:
 def data() -> int:
     """Run ``hudepth-data``."""
     return _main("data")
+
+
+def report() -> int:
+    """Run ``hudepth-report``."""
+    return _main("report")
 
 
 def _main(task: str) -> int:
@@ -64,29 +70,29 @@ def _main(task: str) -> int:
 def rewrite(task: str, arguments: list[str]) -> list[str]:
     """Turn what people type into what Hydra expects.
 
-    ``experiment=x`` becomes ``+experiment=x``; ``hudepth-data prepare`` becomes ``verb=prepare``; in ``hudepth-test`` a
-    ``data.root=x`` without ``data=`` becomes ``++data.root=x``, since the rest of ``data`` is in the checkpoint.
+    ``experiment=x`` becomes ``+experiment=x``; ``hudepth-data prepare`` becomes ``verb=prepare``; where the rest of
+    ``data`` is in a checkpoint, a ``data.root=x`` without ``data=`` becomes ``++data.root=x``.
 
     Args:
-        task: train, test or data.
+        task: train, test, data or report.
         arguments: without the program's name.
 
     Raises:
-        ConfigError: if ``hudepth-data`` is given no verb.
+        ConfigError: if ``hudepth-data`` or ``hudepth-report`` is given no verb.
     """
     result = [f"+{a}" if a.startswith(tuple(f"{g}=" for g in ADDED_GROUPS)) else a for a in arguments]
-    if task == "data" and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
-        verbs = [a for a in result if a in DATA_VERBS]
+    if task in VERBS and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
+        verbs = [a for a in result if a in VERBS[task]]
         words = [a for a in result if "=" not in a and not a.startswith("-")]
         if not verbs:
-            got = f" no verb '{words[0]}'.{did_you_mean(words[0], DATA_VERBS)}" if words else " a verb is missing."
-            raise ConfigError(f"{got.strip()} Type hudepth-data prepare or hudepth-data info.")
+            got = f"no verb '{words[0]}'.{did_you_mean(words[0], VERBS[task])}" if words else "a verb is missing."
+            raise ConfigError(f"{got} Type hudepth-{task} followed by {' or '.join(VERBS[task])}.")
         result = [f"verb={a}" if a == verbs[0] else a for a in result]
     flags = [a for a in result if a in ("-m", "--multirun")]
     result = [*flags, *(a for a in result if a not in flags)]  # between overrides argparse would stumble over them
     if any(a.startswith("resume=") for a in result):  # the keys are those of the run, which Hydra does not know
         result = [f"++{a}" if "." in a.partition("=")[0] and a[0] not in "+~" else a for a in result]
-    if task == "test" and not any(a.startswith(("data=", "+data=")) for a in result):
+    if task in ("test", "report") and not any(a.startswith(("data=", "+data=")) for a in result):
         result = [f"++{a}" if a.startswith("data.") else a for a in result]
     return result
 
@@ -127,7 +133,7 @@ def one_line(error: BaseException, task: str) -> str:
 
     Args:
         error: whatever was raised.
-        task: train, test or data: whose configuration names are suggested.
+        task: whose configuration names are suggested.
     """
     chain = list(_chain(error))
     for cause in chain:

@@ -5,58 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float64
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
-from hudepth.data.store import DepthStore
+from hudepth.baselines import Baseline
 from hudepth.errors import ConfigError
 from hudepth.metrics.protocol import Protocol
+from hudepth.metrics.scoring import BatchScores, BatchTruth
 from hudepth.types import Batch
-
-
-class ConstantDepth(nn.Module):
-    """A trivial baseline: answers every image with the same unit depth map.
-
-    Args:
-        unit_depth: [1, 1, h, w].
-    """
-
-    unit_depth: Tensor
-
-    def __init__(self, unit_depth: Float[Tensor, "1 1 h w"]) -> None:
-        super().__init__()
-        self.register_buffer("unit_depth", unit_depth)
-
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the map, once for each image."""
-        return self.unit_depth.expand(len(image), -1, -1, -1)
-
-
-def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: float) -> dict[str, nn.Module]:
-    """Make the baselines any model must beat, from the training subset alone.
-
-    Args:
-        store: holds the truth.
-        train: positions of the training pairs.
-        max_depth_m: depth is clipped to it and divided by it.
-
-    Returns:
-        ``mean_depth_map``: each pixel's mean over the training set; ``mean_depth``: one mean for all pixels.
-    """
-    total = torch.zeros(store.size, dtype=torch.float64)
-    count = torch.zeros(store.size, dtype=torch.float64)
-    for start in range(0, len(train), 64):
-        _, depth_mm = store.read(train[start : start + 64])
-        unit = (torch.from_numpy(depth_mm).double() / (1000 * max_depth_m)).clamp_(max=1)
-        total += unit.sum(dim=0)
-        count += (unit > 0).sum(dim=0)
-    mean = total.sum() / count.sum()
-    mean_map = torch.where(count > 0, total / count.clamp(min=1), mean)
-    return {
-        "mean_depth_map": ConstantDepth(mean_map.float()[None, None]),
-        "mean_depth": ConstantDepth(mean.expand(store.size).float()[None, None]),
-    }
 
 
 class Evaluation(LightningModule):
@@ -66,13 +23,19 @@ class Evaluation(LightningModule):
         predictors: by name; normalised image to unit depth.
         protocols: how to score.
         max_depth_m: what unit depth 1 stands for.
+        detailed: the predictor whose boundaries and strata are measured too, where a protocol asks for them.
 
     Raises:
         ConfigError: if two protocols have one name, which would mix their rows.
     """
 
     def __init__(
-        self, predictors: Mapping[str, nn.Module], protocols: Sequence[Protocol], *, max_depth_m: float
+        self,
+        predictors: Mapping[str, nn.Module],
+        protocols: Sequence[Protocol],
+        *,
+        max_depth_m: float,
+        detailed: str | None = None,
     ) -> None:
         super().__init__()
         self.predictors = nn.ModuleDict(dict(predictors))
@@ -80,31 +43,57 @@ class Evaluation(LightningModule):
         names = [protocol.name for protocol in protocols]
         if len(set(names)) < len(names):
             raise ConfigError(f"protocol: two have one name among {', '.join(names)}. Give each its own name.")
-        self.max_depth_m = max_depth_m
-        self._rows: dict[tuple[str, str], list[Tensor]] = {}
-        self._indices: list[Tensor] = []
+        self.max_depth_m, self.detailed = max_depth_m, detailed
+        self._collected: dict[tuple[str, ...], list[Tensor]] = {}
         self.indices: list[int] = []
         """Store positions of the scored images, in the order of the rows; known when the test has ended."""
-        self.sums: dict[tuple[str, str], Float[Tensor, "n k"]] = {}
+        self.sums: dict[tuple[str, str], Float64[Tensor, "n k"]] = {}
         """Rows by predictor and protocol, an image each; known when the test has ended."""
+        self.boundary: dict[str, Float64[Tensor, "n k"]] = {}
+        """Boundary metrics of the detailed predictor by protocol, an image a row, where asked for."""
+        self.strata: dict[str, Float64[Tensor, "n bins k"]] = {}
+        """Sums over strata of the detailed predictor by protocol, where asked for."""
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score a batch."""
-        self._indices.append(batch["index"].cpu())
+        self._keep(batch["index"], "index")
+        truth = BatchTruth(batch, max_depth_m=self.max_depth_m)
         for name, predictor in self.predictors.items():
-            pred_m = predictor(batch["image"]).float() * self.max_depth_m
+            plain, flipped = self._predict(predictor, batch["image"])
+            plain_scores = BatchScores(plain, truth)
+            flipped_scores = plain_scores if flipped is None else BatchScores(flipped, truth)
             for protocol in self.protocols:
-                sums = protocol.score(pred_m, batch, max_depth_m=self.max_depth_m)
-                self._rows.setdefault((name, protocol.name), []).append(sums.cpu())
+                scores = flipped_scores if protocol.flip else plain_scores
+                self._keep(scores.sums(protocol), "sums", name, protocol.name)
+                if name == self.detailed and protocol.boundary:
+                    self._keep(scores.boundary(protocol), "boundary", protocol.name)
+                if name == self.detailed and protocol.strata:
+                    self._keep(scores.strata(protocol), "strata", protocol.name)
+
+    def _predict(self, predictor: nn.Module, image: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the prediction [m], and its mean with that of the mirrored image if a protocol wants it."""
+        plain: Tensor = predictor(image).float() * self.max_depth_m
+        if isinstance(predictor, Baseline) or not any(protocol.flip for protocol in self.protocols):
+            return plain, None
+        mirrored: Tensor = predictor(image.flip(-1)).float() * self.max_depth_m
+        return plain, (plain + mirrored.flip(-1)) / 2
+
+    def _keep(self, rows: Tensor, *key: str) -> None:
+        self._collected.setdefault(key, []).append(rows.cpu())
 
     def on_test_epoch_end(self) -> None:
         """Collect the rows of all processes, in the order of the store."""
-        indices = torch.cat(self._collected(self._indices))
+        gathered = {key: torch.cat(self._gathered(rows)) for key, rows in self._collected.items()}
+        indices = gathered.pop(("index",))
         order = indices.argsort()
         self.indices = indices[order].tolist()
-        self.sums = {key: torch.cat(self._collected(rows))[order] for key, rows in self._rows.items()}
+        for (kind, *rest), rows in gathered.items():
+            if kind == "sums":
+                self.sums[rest[0], rest[1]] = rows[order]
+            else:
+                {"boundary": self.boundary, "strata": self.strata}[kind][rest[0]] = rows[order]
 
-    def _collected(self, own: list[Tensor]) -> list[Tensor]:
+    def _gathered(self, own: list[Tensor]) -> list[Tensor]:
         if self.trainer.world_size == 1:
             return own
         everyone: list[list[Tensor]] = [[]] * self.trainer.world_size

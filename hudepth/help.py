@@ -7,13 +7,15 @@ from hudepth.cli import conf_folder, options_of
 ABOUT = {
     "train": "Train a monocular depth model and test its best checkpoint. All goes to runs/<name>/<date_time>/.",
     "test": "Score a checkpoint. It needs nothing but the checkpoint: model, data and split are recorded in it.",
-    "data": "Prepare a data set once as a depth store, or show what is known of it.",
+    "data": "Prepare a data set once as a depth store, show what is known of it, or audit it for leaks and units.",
+    "report": "Compare two runs, draw the figures of a run, or check every claim of the paper.",
 }
 
 USAGE = {
     "train": "hudepth-train [+experiment=NAME] [group=NAME ...] [key=value ...]",
     "test": "hudepth-test checkpoint=<file | run directory | last> [data=NAME] [protocol=NAME] [key=value ...]",
-    "data": "hudepth-data prepare|info data=NAME [data.root=PATH] [key=value ...]",
+    "data": "hudepth-data prepare|info|audit data=NAME [data.root=PATH] [key=value ...]",
+    "report": "hudepth-report compare|figures|paper [key=value ...]",
 }
 
 EXAMPLES = {
@@ -33,10 +35,21 @@ EXAMPLES = {
     ),
     "data": (
         ("hudepth-data info data=nyu_labeled data.root=nyu", "pairs, scenes, splits"),
+        (
+            "hudepth-data audit data=densedepth data.root=nyu",
+            "what each kind of split leaks; the list of names will do",
+        ),
         ("hudepth-data prepare data=nyu_labeled data.root=nyu", "decode, check and resize everything once"),
         ("hudepth-data prepare data=densedepth data.root=nyu_data.zip", "straight from the zip"),
         ("hudepth-data prepare data=folder data.root=mine data.encoding=uint16_mm", "your own images and depths"),
         ("hudepth-data prepare data=manifest data.root=mine data.on_error=skip", "leave out, and list, bad files"),
+    ),
+    "report": (
+        ("hudepth-report compare a=runs/badcl/A b=runs/l1/B", "is b better, on the same test images, and where"),
+        ("hudepth-report compare a=A b=B protocol=paper", "under another protocol"),
+        ("hudepth-report figures run=last", "loss curves and RGB / truth / prediction panels of a run"),
+        ("hudepth-report paper", "what the paper claims beside what is measured here and now"),
+        ("hudepth-report paper runs=[A,B]", "with runs of yours as evidence"),
     ),
 }
 
@@ -53,8 +66,8 @@ def help_text(task: str) -> str:
     lines = [ABOUT[task], "", f"  {USAGE[task]}", "", "Examples"]
     width = max(len(command) for command, _ in EXAMPLES[task])
     lines += [f"  {command:<{width}}  {meaning}" for command, meaning in EXAMPLES[task]]
-    lines += ["", "Groups (choose with group=NAME)"]
     groups = _groups(task)
+    lines += ["", "Groups (choose with group=NAME)"] if groups else []
     lines += [f"  {group:<12}{', '.join(options_of(group))}" for group in groups]
     lines += ["", "Options"]
     lines += [f"  {option:<18}{meaning}" for option, meaning in SHARED_OPTIONS]

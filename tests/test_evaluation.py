@@ -9,12 +9,19 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
-from hudepth.data.datamodule import DepthDataModule
+from hudepth.baselines import ConstantDepth, trivial_baselines
+from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.dataset import StoreDataset
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.errors import ConfigError
-from hudepth.evaluation import ConstantDepth, Evaluation, trivial_baselines
-from hudepth.metrics.protocol import SUM_COLUMNS, Protocol
+from hudepth.evaluation import Evaluation
+from hudepth.metrics.boundary import BOUNDARY_NAMES, boundary_metrics
+from hudepth.metrics.protocol import Protocol
+from hudepth.metrics.scoring import SUM_COLUMNS, image_table
+from hudepth.metrics.strata import STRATA
+from hudepth.metrics.summary import ImageTable, summarise
 from hudepth.models import TinyUNet
+from hudepth.types import Batch
 
 PAPER = Protocol(name="paper", ssim_window=3)
 NATIVE = Protocol(
@@ -41,6 +48,11 @@ def evaluate(data: DepthDataModule, predictors: dict[str, nn.Module], *protocols
         enable_progress_bar=False, use_distributed_sampler=False,
     ).test(evaluation, datamodule=data, verbose=False)  # fmt: skip
     return evaluation
+
+
+def table(data: DepthDataModule, evaluation: Evaluation, name: str = "model") -> ImageTable:
+    records = [data.store.records[index] for index in evaluation.indices]
+    return image_table(PAPER, evaluation.sums[name, "paper"], records)
 
 
 @pytest.fixture
@@ -80,7 +92,7 @@ def test_rows_against_numpy(cache: Path, net: TinyUNet) -> None:
         pred_m = 10 * net(normal)[:, 0].double().numpy()
     truth_m = np.minimum(depth_mm / 1000, 10)
     assert (truth_m == 0).any()
-    rows = PAPER.per_image(evaluation.sums["model", "paper"])
+    rows = table(data, evaluation).values
     for row, (p, t) in enumerate(zip(pred_m, truth_m, strict=True)):
         p, t = p[t > 0], t[t > 0]
         assert rows["abs_rel"][row].item() == pytest.approx(np.mean(np.abs(p - t) / t), rel=1e-6)
@@ -98,55 +110,11 @@ def test_rows_are_in_the_order_of_the_store(cache: Path, net: TinyUNet) -> None:
     torch.testing.assert_close(*rows, rtol=1e-6, atol=1e-6, equal_nan=True)
 
 
-def test_constant_depth_answers_every_image_alike() -> None:
-    unit_depth = torch.rand(1, 1, 4, 6)
-    baseline = ConstantDepth(unit_depth)
-    for count in (1, 3):
-        answer = baseline(torch.randn(count, 3, 4, 6))
-        assert answer.shape == (count, 1, 4, 6)
-        assert all(torch.equal(one[None], unit_depth) for one in answer)
-    assert list(baseline.parameters()) == []
-    assert baseline.to(torch.float64)(torch.zeros(1, 3, 4, 6)).dtype == torch.float64  # it moves as networks do
-
-
-class FakeStore:
-    """Truth that is made up, in the form in which a depth store gives it."""
-
-    def __init__(self, depth_mm: np.ndarray) -> None:
-        self.depth_mm, self.size = depth_mm, depth_mm.shape[1:]
-
-    def read(self, indices: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros((len(indices), *self.size, 3), np.uint8), self.depth_mm[list(indices)]
-
-
-@pytest.mark.parametrize("pairs", [1, 63, 64, 65, 200])
-def test_trivial_baselines(pairs: int) -> None:
-    rng = np.random.default_rng(pairs)
-    depth_mm = rng.integers(500, 15_000, (pairs + 7, 5, 4)).astype(np.uint16)
-    depth_mm[rng.random(depth_mm.shape) < 0.3] = 0
-    depth_mm[:, 2, 1] = 0  # measured in no training image
-    train = rng.permutation(pairs + 7)[:pairs].tolist()
-    depth_mm[[i for i in range(pairs + 7) if i not in train]] = 1  # what must not be looked at
-    bare = trivial_baselines
-    while hasattr(bare, "__wrapped__"):  # the checker of the tests would insist on a real store
-        bare = bare.__wrapped__
-    made = bare(FakeStore(depth_mm), train, max_depth_m=8.0)  # type: ignore[arg-type]
-    assert list(made) == ["mean_depth_map", "mean_depth"]
-
-    metres = np.where(depth_mm[train] == 0, np.nan, np.minimum(depth_mm[train] / 1000, 8.0))
-    mean = np.nanmean(metres)
-    counted = (~np.isnan(metres)).sum(axis=0)
-    mean_map = np.where(counted > 0, np.nansum(metres, axis=0) / np.maximum(counted, 1), mean)
-    answers = {name: (8 * net(torch.zeros(1, 3, 5, 4)))[0, 0].numpy() for name, net in made.items()}
-    np.testing.assert_allclose(answers["mean_depth"], np.full((5, 4), mean), rtol=1e-6)
-    np.testing.assert_allclose(answers["mean_depth_map"], mean_map, rtol=1e-6)
-
-
 def test_baselines_stand_beside_the_model(cache: Path, net: TinyUNet) -> None:
     data = make_data(cache)
     baselines = trivial_baselines(data.store, data.split.train, max_depth_m=data.max_depth_m)
     evaluation = evaluate(data, {"model": net, **baselines}, PAPER)
-    rmse = {name: PAPER.summary(evaluation.sums[name, "paper"])["rmse"] for name in ("model", *baselines)}
+    rmse = {name: summarise(table(data, evaluation, name), averaging="image")["rmse"] for name in ("model", *baselines)}
     assert rmse["mean_depth"] < rmse["model"]  # which has learnt nothing
     truth_mm = data.store.read(data.split.test)[1]
     constant = 10 * baselines["mean_depth"].unit_depth[0, 0, 0, 0].item()  # type: ignore[union-attr, index]
@@ -171,3 +139,69 @@ def test_two_protocols_of_one_name(net: TinyUNet) -> None:
     with pytest.raises(ConfigError) as caught:
         Evaluation({"model": net}, [PAPER, NATIVE, PAPER], max_depth_m=10.0)
     assert str(caught.value) == "protocol: two have one name among paper, native, paper. Give each its own name."
+
+
+def test_a_flip_averages_the_mirrored_prediction(cache: Path, net: TinyUNet) -> None:
+    data = make_data(cache)
+    flip = dataclasses.replace(PAPER, name="flip", flip=True)
+    baselines = trivial_baselines(data.store, data.split.train, max_depth_m=data.max_depth_m)
+    evaluation = evaluate(data, {"model": net, **baselines}, PAPER, flip)
+
+    class Mirrored(nn.Module):
+        def forward(self, image: Tensor) -> Tensor:
+            mirrored: Tensor = (net(image) + net(image.flip(-1)).flip(-1)) / 2
+            return mirrored
+
+    expected = evaluate(data, {"model": Mirrored()}, PAPER)
+    torch.testing.assert_close(
+        evaluation.sums["model", "flip"], expected.sums["model", "paper"], rtol=1e-6, atol=1e-6, equal_nan=True
+    )
+    assert not torch.equal(evaluation.sums["model", "flip"][:, :-1], evaluation.sums["model", "paper"][:, :-1])
+    for name in baselines:  # they have no left and right to average
+        ours, plain = (evaluation.sums[name, protocol].nan_to_num() for protocol in ("flip", "paper"))
+        assert torch.equal(ours, plain)
+
+
+def test_protocols_scored_together_or_alone_are_the_same(cache: Path, net: TinyUNet) -> None:
+    protocols = [
+        PAPER,
+        NATIVE,
+        dataclasses.replace(NATIVE, name="flip", flip=True),
+        dataclasses.replace(NATIVE, name="tight", min_depth_m=2.0, max_depth_m=4.0),
+        dataclasses.replace(NATIVE, name="aligned", alignment="median"),
+        dataclasses.replace(NATIVE, name="nearest", resize="nearest", crop=None, valid="measured"),
+        dataclasses.replace(NATIVE, name="other", ssim_window=5, ssim_data_range_m=5.0, clamp=False),
+    ]
+    data = make_data(cache)
+    together = evaluate(data, {"model": net}, *protocols)
+    for protocol in protocols:
+        alone = evaluate(data, {"model": net}, protocol)
+        torch.testing.assert_close(
+            together.sums["model", protocol.name], alone.sums["model", protocol.name],
+            rtol=1e-9, atol=1e-9, equal_nan=True,
+        )  # fmt: skip
+    rows = [together.sums["model", protocol.name].nan_to_num() for protocol in protocols]
+    assert all(not torch.equal(a, b) for i, a in enumerate(rows) for b in rows[:i])
+
+
+def test_edges_and_strata_are_measured_where_asked_for(cache: Path, net: TinyUNet) -> None:
+    data = make_data(cache)
+    detailed = dataclasses.replace(PAPER, name="detailed", boundary=True, strata=True)
+    evaluation = Evaluation({"model": net, "other": net}, [PAPER, detailed], max_depth_m=10.0, detailed="model")
+    Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_model_summary=False,
+        enable_progress_bar=False, use_distributed_sampler=False,
+    ).test(evaluation, datamodule=data, verbose=False)  # fmt: skip
+    assert set(evaluation.boundary) == set(evaluation.strata) == {"detailed"}
+    assert evaluation.boundary["detailed"].shape == (6, len(BOUNDARY_NAMES))
+    assert evaluation.strata["detailed"].shape[:2] == (6, len(STRATA))
+    (batch,) = make_batches(data)
+    with torch.inference_mode():
+        expected = boundary_metrics(10 * net(batch["image"]), 10 * batch["unit_depth"], batch["valid"])
+    for column, name in zip(evaluation.boundary["detailed"].T, BOUNDARY_NAMES, strict=True):
+        torch.testing.assert_close(column, expected[name], rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+def make_batches(data: DepthDataModule) -> list[Batch]:
+    dataset = StoreDataset(data.store, sorted(data.split.test))
+    return [preprocess(dataset.__getitems__(range(len(dataset))), max_depth_m=10.0)]

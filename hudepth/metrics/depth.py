@@ -21,6 +21,7 @@ formulas serve one image and pixels pooled over many.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -37,10 +38,86 @@ SUM_NAMES = (
 )  # fmt: skip
 """Keys of :func:`depth_sums`."""
 
+DELTAS = (1.25, 1.25**2, 1.25**3)
+"""Thresholds of delta1, delta2, delta3."""
+
 METRIC_NAMES = (
     "abs_rel", "sq_rel", "mse", "rmse", "rmse_log", "log10", "silog", "mae", "delta1", "delta2", "delta3",
 )  # fmt: skip
 """Keys of :func:`depth_metrics_from_sums`."""
+
+
+class DepthMaps(NamedTuple):
+    """What the sums are made of, pixel by pixel: any number of crops and masks can be summed from one computation."""
+
+    maps: Float[Tensor, "k b 1 h w"]
+    """The terms named in :data:`SUM_NAMES` after the count. Where not valid, errors are 0 and deltas 1."""
+    shift: Float64[Tensor, " b"]
+    """Mean log ratio of each image, taken out of ``log`` and ``log_squared``: silog subtracts nearly equal sums."""
+
+    def sums(
+        self, valid: Bool[Tensor, "b 1 h w"], *, masked: bool, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> dict[str, Float64[Tensor, " b"]]:
+        """Sum over the valid pixels of some rows and columns.
+
+        Args:
+            valid: which pixels count; none beyond those the maps were made with.
+            masked: whether the maps were made with this very mask, which saves applying it.
+            rows: of the crop.
+            columns: of the crop.
+        """
+        maps, valid = self.maps[..., rows, columns], valid[..., rows, columns]
+        count = valid.flatten(1).sum(dim=1)
+        if masked:
+            totals = maps.sum(dim=(-3, -2, -1)).double()
+            totals[-len(DELTAS) :] -= valid[0].numel() - count  # what is not valid was counted
+        else:
+            totals = (maps * valid).sum(dim=(-3, -2, -1)).double()
+            if not bool(totals.isfinite().all()):  # 0 times NaN is NaN
+                totals = torch.where(valid, maps, 0.0).sum(dim=(-3, -2, -1)).double()
+        sums = dict(zip(SUM_NAMES, (count.double(), *totals), strict=True))
+        centred, count64 = sums["log"], sums["count"]
+        sums["log"] = centred + count64 * self.shift
+        sums["log_squared"] = sums["log_squared"] + self.shift * (2 * centred + count64 * self.shift)
+        return sums
+
+
+@torch.no_grad()
+def depth_maps(
+    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> DepthMaps:
+    """Compute what the metrics are made of at each pixel.
+
+    Args:
+        pred_m: predicted depth [m].
+        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
+        valid: True where the truth is measured.
+
+    Returns:
+        Maps in float32 (float64 for float64).
+    """
+    # 1 m against 1 m where not valid: no error there
+    pred = torch.where(valid, full_precision(pred_m), 1.0)
+    target = torch.where(valid, full_precision(target_m), 1.0)
+    maps = pred.new_empty((len(SUM_NAMES) - 1, *pred.shape))  # written in place: six times faster than stacked
+    relative, sq_rel, squared, absolute, log, log_squared, log10, *deltas = maps.unbind()
+    torch.sub(pred, target, out=absolute).abs_()
+    torch.div(absolute, target, out=relative)
+    torch.mul(relative, absolute, out=sq_rel)
+    torch.mul(absolute, absolute, out=squared)
+    positive = pred.clamp_(min=MIN_DEPTH_M)
+    ratio = positive / target
+    torch.log(ratio, out=log)
+    torch.abs(log, out=log10).div_(math.log(10))
+    count = valid.flatten(1).sum(dim=1).clamp_min(1)
+    shift = (log.flatten(1).sum(dim=1).double() / count).to(log.dtype)
+    shift = torch.where(shift.isfinite(), shift, 0.0)  # else one bad pixel would reach the sums of all others
+    log.sub_(torch.where(valid, shift.reshape(-1, 1, 1, 1), 0.0))
+    torch.mul(log, log, out=log_squared)
+    worse = torch.maximum(ratio, target / positive)
+    for delta, threshold in zip(deltas, DELTAS, strict=True):
+        torch.lt(worse, threshold, out=delta)
+    return DepthMaps(maps, shift.double())
 
 
 def depth_sums(
@@ -54,31 +131,9 @@ def depth_sums(
         valid: True where the truth is measured.
 
     Returns:
-        The sums named in :data:`SUM_NAMES`. Maps are float32 (float64 for float64), their sums float64.
+        The sums named in :data:`SUM_NAMES`: of :func:`depth_maps`, in float64.
     """
-    # 1 m against 1 m where not valid: no error there, so only counts need the mask
-    pred = torch.where(valid, full_precision(pred_m), 1.0)
-    target = torch.where(valid, full_precision(target_m), 1.0)
-    error = (pred - target).abs()
-    relative = error / target
-    positive = pred.clamp_min(MIN_DEPTH_M)
-    ratio = positive / target
-    # squared in float64: silog subtracts nearly equal sums if the prediction is off by a constant factor
-    log_ratio = ratio.log().double()
-    worse = torch.maximum(ratio, target / positive)
-    return {
-        "count": _total(valid),
-        "abs_rel": _total(relative),
-        "sq_rel": _total(relative * error),
-        "squared": _total(error.square()),
-        "absolute": _total(error),
-        "log": _total(log_ratio),
-        "log_squared": _total(log_ratio.square()),
-        "log10": _total(log_ratio.abs()) / math.log(10),
-        "delta1": _total((worse < 1.25) & valid),
-        "delta2": _total((worse < 1.25**2) & valid),
-        "delta3": _total((worse < 1.25**3) & valid),
-    }
+    return depth_maps(pred_m, target_m, valid).sums(valid, masked=True)
 
 
 def depth_metrics_from_sums(
@@ -122,9 +177,3 @@ def depth_metrics(
     """Metrics of each image: :func:`depth_metrics_from_sums` of :func:`depth_sums`."""
     sums = depth_sums(pred_m, target_m, valid)
     return depth_metrics_from_sums(sums, silog_lambda=silog_lambda, silog_factor=silog_factor)
-
-
-def _total(x: Tensor) -> Tensor:
-    if x.dtype == torch.bool:  # three times faster counted than cast
-        return x.sum(dim=(1, 2, 3)).double()
-    return x.sum(dim=(1, 2, 3), dtype=torch.float64)

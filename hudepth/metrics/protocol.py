@@ -8,20 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional
 
 from hudepth.errors import ConfigError, did_you_mean
+from hudepth.metrics.alignment import ALIGNMENTS
 from hudepth.metrics.collection import AVERAGINGS
-from hudepth.metrics.depth import SUM_NAMES, depth_metrics_from_sums, depth_sums
-from hudepth.metrics.ssim import ssim
-from hudepth.types import Batch
 
 RESOLUTIONS = ("network", "native")
+RESIZES = ("bilinear", "bicubic", "nearest")
+VALID_RULES = ("open", "closed", "measured")
+
+
+class SummaryOptions(TypedDict):
+    """Keyword arguments of :func:`hudepth.metrics.summary.summarise` and of the bootstrap."""
+
+    averaging: str
+    silog_lambda: float
+    silog_factor: float
 
 
 @dataclass(frozen=True)
@@ -34,17 +41,27 @@ class Protocol:
 
     name: str
     resolution: str = "network"
-    """``network``: prediction and truth at training size; ``native``: prediction resized bilinearly to the truth's."""
+    """``network``: prediction and truth at training size; ``native``: prediction resized to the truth's."""
+    resize: str = "bilinear"
+    """How: ``bilinear``, ``bicubic`` or ``nearest``."""
+    flip: bool = False
+    """Average the network's prediction with that of the mirrored image. Trivial baselines are not mirrored."""
+    alignment: str = "none"
+    """Bring each prediction onto the scale of its truth first: ``none``, ``median``, ``least_squares`` (scale and
+    shift) or ``affine_inverse`` (scale and shift of inverse depth); see :mod:`hudepth.metrics.alignment`."""
     crop: Sequence[int] | None = None
     """Rows and columns that count, [top, bottom, left, right] in an image of ``crop_size``; None for all."""
-    crop_size: Sequence[int] = (480, 640)
-    """(height, width) the crop refers to; for images of another size it is scaled."""
+    crop_size: Sequence[int] | None = (480, 640)
+    """(height, width) the crop refers to; for images of another size it is scaled. None: it counts pixels of each image
+    as it is, and images that it exceeds are left out."""
+    valid: str = "open"
+    """Which measured pixels count: ``open``: min_depth_m < truth < max_depth_m; ``closed``: the same with both ends;
+    ``measured``: all of them, whatever their depth."""
     min_depth_m: float = 0.0
-    """A pixel counts where min_depth_m < truth < max_depth_m, both excluded."""
     max_depth_m: float | None = None
     """None for no upper cap."""
     clamp: bool = False
-    """Clamp predictions to [min_depth_m, max_depth_m] first."""
+    """Clamp predictions to [min_depth_m, max_depth_m], after alignment."""
     averaging: str = "image"
     """``image``: metrics of each image, then their mean; ``pooled``: over all pixels of the subset at once."""
     silog_lambda: float = 1.0
@@ -52,12 +69,19 @@ class Protocol:
     ssim_data_range_m: float = 10.0
     """What SSIM takes for the largest possible difference."""
     ssim_window: int = 11
+    boundary: bool = False
+    """Also measure depth edges; see :mod:`hudepth.metrics.boundary`."""
+    strata: bool = False
+    """Also measure errors by depth, distance to an edge, region and category; see :mod:`hudepth.metrics.strata`."""
     extra: dict[str, Any] = field(default_factory=dict)
     """Further words for the stamp, for example the source."""
 
     def __post_init__(self) -> None:
         for key, value, choices in (
             ("resolution", self.resolution, RESOLUTIONS),
+            ("resize", self.resize, RESIZES),
+            ("alignment", self.alignment, ALIGNMENTS),
+            ("valid", self.valid, VALID_RULES),
             ("averaging", self.averaging, AVERAGINGS),
         ):
             if value not in choices:
@@ -65,13 +89,12 @@ class Protocol:
                     f"protocol.{self.name}.{key}: no '{value}'.{did_you_mean(value, choices)} "
                     f"Pass one of {', '.join(choices)}."
                 )
-        if len(self.crop_size) != 2 or min(self.crop_size) < 1:
-            raise ConfigError(f"protocol.{self.name}.crop_size: {list(self.crop_size)} is not [height,width].")
-        if self.crop is not None and not _is_crop(self.crop, self.crop_size):
-            raise ConfigError(
-                f"protocol.{self.name}.crop: {list(self.crop)} is not [top,bottom,left,right] "
-                f"within {list(self.crop_size)}."
-            )
+        size = self.crop_size
+        if size is not None and (len(size) != 2 or min(size) < 1):
+            raise ConfigError(f"protocol.{self.name}.crop_size: {list(size)} is not [height,width].")
+        if self.crop is not None and not _is_crop(self.crop, size):
+            within = f" within {list(size)}" if size else ""
+            raise ConfigError(f"protocol.{self.name}.crop: {list(self.crop)} is not [top,bottom,left,right]{within}.")
         if self.min_depth_m < 0:
             raise ConfigError(f"protocol.{self.name}.min_depth_m: {self.min_depth_m} is negative.")
         if self.max_depth_m is not None and self.max_depth_m <= self.min_depth_m:
@@ -86,49 +109,31 @@ class Protocol:
         """Whether it scores against native-resolution truth."""
         return self.resolution == "native"
 
-    def score(self, pred_m: Float[Tensor, "b 1 h w"], batch: Batch, *, max_depth_m: float) -> Float[Tensor, "b k"]:
-        """Return the sums of each image, one row an image, columns as in :data:`SUM_COLUMNS`.
+    @property
+    def summary_options(self) -> SummaryOptions:
+        """What turns the metrics of images into those of a subset; see :mod:`hudepth.metrics.summary`."""
+        return {"averaging": self.averaging, "silog_lambda": self.silog_lambda, "silog_factor": self.silog_factor}
 
-        Args:
-            pred_m: predicted depth at network resolution [m].
-            batch: holds the truth.
-            max_depth_m: what unit depth 1 stands for in the batch.
+    @property
+    def caps(self) -> tuple[str, float, float | None]:
+        """What decides which measured pixels count: equal caps, equal pixels."""
+        return (self.valid, self.min_depth_m, self.max_depth_m)
 
-        Raises:
-            ConfigError: if the protocol needs native truth and the batch has none.
-        """
-        if not self.needs_native:
-            return self._sums(pred_m, batch["unit_depth"] * max_depth_m, batch["valid"])
-        if "native_depth" not in batch:
-            raise ConfigError(
-                f"protocol={self.name} scores at native resolution, which this store was prepared without. "
-                "Pass data.native=true, or protocol=paper."
-            )
-        rows = []
-        for pred, native in zip(pred_m, batch["native_depth"], strict=True):
-            truth = native[None].to(pred.device)
-            full = functional.interpolate(pred[None], size=truth.shape[-2:], mode="bilinear", align_corners=False)
-            rows.append(self._sums(full, truth, truth > 0))
-        return torch.cat(rows)
+    def within_caps(self, truth_m: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
+        """Tell which measured depths [m] count."""
+        if self.valid == "measured":
+            return torch.ones_like(truth_m, dtype=torch.bool)
+        below, above = (torch.gt, torch.lt) if self.valid == "open" else (torch.ge, torch.le)
+        within = below(truth_m, self.min_depth_m)
+        return within if self.max_depth_m is None else within & above(truth_m, self.max_depth_m)
 
-    def _sums(
-        self, pred_m: Float[Tensor, "b 1 h w"], truth_m: Float[Tensor, "b 1 h w"], measured: Bool[Tensor, "b 1 h w"]
-    ) -> Float[Tensor, "b k"]:
-        if self.clamp:
-            pred_m = pred_m.clamp(self.min_depth_m, self.max_depth_m)
-        rows, columns = self.window(*truth_m.shape[-2:])
-        pred_m, truth_m, valid = (x[..., rows, columns] for x in (pred_m, truth_m, measured))
-        valid = valid & (truth_m > self.min_depth_m)
-        if self.max_depth_m is not None:
-            valid = valid & (truth_m < self.max_depth_m)
-        similarity = ssim(pred_m, truth_m, valid, data_range=self.ssim_data_range_m, window=self.ssim_window)
-        return torch.stack([*depth_sums(pred_m, truth_m, valid).values(), similarity.double()], dim=1)
-
-    def window(self, height: int, width: int) -> tuple[slice, slice]:
-        """Return the rows and columns that count in an image of this size."""
+    def window(self, height: int, width: int) -> tuple[slice, slice] | None:
+        """Return the rows and columns that count in an image of this size; None if the crop exceeds it."""
         if self.crop is None:
-            return slice(None), slice(None)
+            return slice(0, height), slice(0, width)
         top, bottom, left, right = self.crop
+        if self.crop_size is None:
+            return (slice(top, bottom), slice(left, right)) if bottom <= height and right <= width else None
         y, x = height / self.crop_size[0], width / self.crop_size[1]
         return slice(round(top * y), round(bottom * y)), slice(round(left * x), round(right * x))
 
@@ -138,15 +143,14 @@ class Protocol:
             **self.extra,
             "name": self.name,
             "resolution": self.resolution,
-            "resize": "bilinear, align_corners=False" if self.needs_native else "none",
+            "resize": f"{self.resize}, align_corners=False" if self.needs_native else "none",
             "crop": list(self.crop) if self.crop else None,
-            "crop_size": list(self.crop_size) if self.crop else None,
-            "valid": f"measured, {self.min_depth_m:.15g} m < truth"
-            + ("" if self.max_depth_m is None else f" < {self.max_depth_m:.15g} m"),
+            "crop_size": list(self.crop_size) if self.crop and self.crop_size else None,
+            "valid": self._valid_rule(),
             "clamp_m": [self.min_depth_m, self.max_depth_m] if self.clamp else None,
             "averaging": self.averaging,
-            "alignment": "none",
-            "test_time_flip": False,
+            "alignment": self.alignment,
+            "test_time_flip": self.flip,
             "silog": {"lambda": self.silog_lambda, "factor": self.silog_factor},
             "ssim": {
                 "window": self.ssim_window,
@@ -157,38 +161,18 @@ class Protocol:
             "units": UNITS,
         }
 
-    def per_image(self, sums: Float[Tensor, "n k"]) -> dict[str, Float[Tensor, " n"]]:
-        """Return the metrics of each image from its sums; NaN where no pixel counts."""
-        return {**self._finish(sums.T), "ssim": sums[:, -1]}
-
-    def summary(self, sums: Float[Tensor, "n k"]) -> dict[str, float]:
-        """Return the metrics of the subset from the sums of its images, averaged as the protocol says.
-
-        Images without a pixel that counts are skipped. A prediction that is NaN where a pixel counts makes the metric
-        NaN: skipping it would flatter the model.
-
-        Raises:
-            ConfigError: if no pixel of any image counts.
-        """
-        counted = sums[sums[:, 0] > 0]
-        if not len(counted):
-            raise ConfigError(
-                f"protocol={self.name}: no pixel of {len(sums)} images counts; look at its crop and caps."
-            )
-        metrics = self._finish(counted.T if self.averaging == "image" else counted.sum(dim=0))
-        ssim_mean = counted[:, -1].nanmean()  # NaN where an image has no whole window of valid pixels
-        return {**{name: values.mean().item() for name, values in metrics.items()}, "ssim": ssim_mean.item()}
-
-    def _finish(self, columns: Float[Tensor, k * n]) -> dict[str, Float[Tensor, "*n"]]:
-        sums = dict(zip(SUM_COLUMNS, columns, strict=True))
-        del sums["ssim"]
-        return depth_metrics_from_sums(sums, silog_lambda=self.silog_lambda, silog_factor=self.silog_factor)
+    def _valid_rule(self) -> str:
+        less = "<" if self.valid == "open" else "<="
+        if self.valid == "measured":
+            return "measured"
+        upper = "" if self.max_depth_m is None else f" {less} {self.max_depth_m:.15g} m"
+        return f"measured, {self.min_depth_m:.15g} m {less} truth{upper}"
 
 
-def _is_crop(crop: Sequence[int], size: Sequence[int]) -> bool:
-    return len(crop) == 4 and 0 <= crop[0] < crop[1] <= size[0] and 0 <= crop[2] < crop[3] <= size[1]
+def _is_crop(crop: Sequence[int], size: Sequence[int] | None) -> bool:
+    if len(crop) != 4 or not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
+        return False
+    return size is None or (crop[1] <= size[0] and crop[3] <= size[1])
 
 
 UNITS = {"mae": "m", "rmse": "m", "sq_rel": "m", "mse": "m^2", "others": "1"}
-SUM_COLUMNS = (*SUM_NAMES, "ssim")
-"""Columns of :meth:`Protocol.score`: those of :func:`hudepth.metrics.depth.depth_sums`, then each image's ssim."""

@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
@@ -52,9 +54,9 @@ def ssim_map(
         # variances are differences of nearly equal squares: centring the values keeps those small
         shift = data_range / 2
         p, t = full_precision(pred) - shift, full_precision(target) - shift
-        moments = window_sum(torch.cat([p, t, p * p, t * t, p * t], dim=1), gaussian(window, sigma))
-        mean_p, mean_t, square_p, square_t, product = moments.unbind(dim=1)
-        var = square_p - mean_p * mean_p + square_t - mean_t * mean_t
+        moments = window_sum(torch.cat([p, t, p * p + t * t, p * t], dim=1), gaussian(window, sigma))
+        mean_p, mean_t, squares, product = moments.unbind(dim=1)
+        var = squares - mean_p * mean_p - mean_t * mean_t
         cov = product - mean_p * mean_t
         mean_p, mean_t = mean_p + shift, mean_t + shift
         c1, c2 = (k1 * data_range) ** 2, (k2 * data_range) ** 2
@@ -100,8 +102,13 @@ def ssim_sums(
     """
     pred, target = torch.where(valid, pred, 0.0), torch.where(valid, target, 0.0)
     values = ssim_map(pred, target, data_range=data_range, window=window, sigma=sigma, k1=k1, k2=k2)
-    whole = window_sum(valid.float(), [1.0] * window) == window**2
-    return masked_sum(values.double(), whole, dim=(1, 2, 3)).flatten(), whole.sum(dim=(1, 2, 3))
+    whole = whole_windows(valid, window)
+    return masked_sum(values, whole, dim=(1, 2, 3)).flatten().double(), whole.sum(dim=(1, 2, 3))
+
+
+def whole_windows(valid: Bool[Tensor, "b 1 h w"], window: int) -> Bool[Tensor, "b 1 rows columns"]:
+    """Tell of each window, in the order of :func:`ssim_map`, whether all its pixels are valid."""
+    return window_sum(valid.float(), [1.0] * window) == window**2
 
 
 def gaussian(window: int, sigma: float) -> list[float]:
@@ -113,8 +120,11 @@ def gaussian(window: int, sigma: float) -> list[float]:
 def window_sum(x: Float[Tensor, "b c h w"], weights: Sequence[float]) -> Float[Tensor, "b c rows columns"]:
     """Weighted sum over each square window, with the same ``weights`` along rows and columns.
 
-    Adding shifted views is over 20 times faster on a CPU than convolving one channel, and never in TF32.
+    On a CPU OpenCV filters four times faster than torch can add shifted views. Elsewhere, or if a gradient or float64
+    is wanted, adding views is over 20 times faster than convolving one channel, and never in TF32.
     """
+    if x.device.type == "cpu" and x.dtype == torch.float32 and not (torch.is_grad_enabled() and x.requires_grad):
+        return _filtered(x, weights)
     for dim in (-1, -2):
         size = x.shape[dim] - len(weights) + 1
         total = x.narrow(dim, 0, size) * weights[0]
@@ -122,6 +132,16 @@ def window_sum(x: Float[Tensor, "b c h w"], weights: Sequence[float]) -> Float[T
             total.add_(x.narrow(dim, offset, size), alpha=weight)
         x = total
     return x
+
+
+def _filtered(x: Tensor, weights: Sequence[float]) -> Tensor:
+    kernel, size = np.array(weights, np.float32), len(weights)
+    b, c, h, w = x.shape
+    result = np.empty((b * c, h - size + 1, w - size + 1), np.float32)
+    for plane, target in zip(x.detach().flatten(0, 1).numpy(), result, strict=True):
+        full = cv2.sepFilter2D(plane, cv2.CV_32F, kernel, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
+        target[:] = full[: h - size + 1, : w - size + 1]
+    return torch.from_numpy(result).reshape(b, c, *result.shape[1:])
 
 
 def _check_size(image: Tensor, window: int) -> None:

@@ -41,7 +41,7 @@ from hudepth.module import DepthModule
 from hudepth.tasks.checks import check_config, check_input, check_monitor
 from hudepth.tasks.common import build_data, build_protocols, plain, without_known_warnings
 from hudepth.tasks.resume import resumed_config
-from hudepth.tasks.test import score_checkpoint
+from hudepth.tasks.score import score_checkpoint
 
 RUN_ENV = "HUDEPTH_RUN"
 """Tells the processes of a distributed run which run directory the first one made."""

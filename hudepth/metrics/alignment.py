@@ -1,0 +1,82 @@
+"""Bringing a prediction onto the scale of its truth, image by image, before it is scored.
+
+With p the prediction and t the truth at the valid pixels of one image:
+
+    median          p * median(t) / median(p)                          Zhou et al. 2017
+    least_squares   s p + o,  s and o minimise sum (s p + o - t)^2     Ke et al. 2024 (Marigold)
+    affine_inverse  1 / (s / p + o),  s and o minimise sum (s / p + o - 1 / t)^2    Ranftl et al. 2022 (MiDaS)
+
+An aligned score says how well a shape is predicted, not how many metres: it never stands beside an unaligned one.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hudepth.errors import ConfigError, did_you_mean
+
+ALIGNMENTS = ("none", "median", "least_squares", "affine_inverse")
+
+MAX_DEPTH_M = 1e3
+"""Where ``affine_inverse`` would answer beyond this, or behind the camera, it answers this [m]."""
+_MIN_DEPTH_M = 1e-3
+
+
+def align(
+    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"], *, kind: str
+) -> Float[Tensor, "b 1 h w"]:
+    """Return the predictions, each aligned to its truth over its valid pixels.
+
+    An image without a valid pixel is returned as it is. A prediction that is constant where valid has no scale to
+    fit: it is shifted. A median of 0 or less cannot be scaled and is returned as it is.
+
+    Args:
+        pred_m: predicted depth [m].
+        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
+        valid: which pixels the alignment may see.
+        kind: one of :data:`ALIGNMENTS`.
+
+    Raises:
+        ConfigError: if the kind is unknown.
+    """
+    if kind not in ALIGNMENTS:
+        raise ConfigError(
+            f"alignment: no '{kind}'.{did_you_mean(kind, ALIGNMENTS)} Pass one of {', '.join(ALIGNMENTS)}."
+        )
+    if kind == "none":
+        return pred_m
+    images = zip(pred_m.double(), target_m.double(), valid, strict=True)
+    aligned = [_ONE[kind](pred, pred[mask], target[mask]) if mask.any() else pred for pred, target, mask in images]
+    return torch.stack(aligned).to(pred_m.dtype)
+
+
+def _median(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
+    # the mean of the two middle values, as numpy's: torch.median takes the lower
+    middle_p, middle_t = (x.quantile(0.5) if x.numel() < 2**24 else x.median() for x in (p, t))
+    return pred * (middle_t / middle_p) if middle_p > 0 else pred
+
+
+def _least_squares(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
+    scale, shift = _line(p, t)
+    return scale * pred + shift
+
+
+def _affine_inverse(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
+    scale, shift = _line(1 / p.clamp_min(_MIN_DEPTH_M), 1 / t)
+    inverse = scale / pred.clamp_min(_MIN_DEPTH_M) + shift
+    return 1 / inverse.clamp_min(1 / MAX_DEPTH_M)
+
+
+def _line(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit y = scale x + shift; scale 1 where x is constant."""
+    mean_x, mean_y = x.mean(), y.mean()
+    centred = x - mean_x
+    spread = centred.square().sum()
+    # a spread that is rounding noise of a constant prediction has no slope to it
+    scale = (centred * (y - mean_y)).sum() / spread if spread > 1e-12 * x.square().sum() else torch.ones_like(mean_x)
+    return scale, mean_y - scale * mean_x
+
+
+_ONE = {"median": _median, "least_squares": _least_squares, "affine_inverse": _affine_inverse}

@@ -1,0 +1,272 @@
+"""How well depth edges are predicted: three published measures, per image.
+
+``edge_*``: Hu et al. 2019 ("Revisiting Single Image Depth Estimation", WACV): pixels of steep depth, prediction
+    against truth, at three thresholds.
+``si_boundary_f1``: Bochkovskii et al. 2024 ("Depth Pro", arXiv 2410.02073, section 3.2): which of two neighbours is
+    nearer, by depth ratio; the scale of the prediction does not matter.
+``dbe_*_px``: Koch et al. 2018 (iBims-1, arXiv 1805.01328): how far edges of prediction and truth lie apart.
+
+A measure is NaN where the truth has no edge, and 0 (the largest, if a distance) where only the prediction has none. So
+the truth alone decides which images count, and two predictions are averaged over the same ones. All measures depend
+on the resolution, and on that of depth itself: truth in coarse levels has steps where the scene has none.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hudepth.masked import full_precision
+from hudepth.metrics.depth import MIN_DEPTH_M
+
+EDGE_THRESHOLDS = (0.25, 0.5, 1)
+"""Sobel magnitudes [m] of Hu et al. above which a pixel is an edge."""
+
+BOUNDARY_NAMES = (
+    *(f"edge_{score}_{threshold}" for threshold in EDGE_THRESHOLDS for score in ("precision", "recall", "f1")),
+    "si_boundary_f1", "dbe_acc_px", "dbe_comp_px",
+)  # fmt: skip
+"""Keys of :func:`boundary_metrics`."""
+
+_CANNY_SCALE = 8000  # unit depth in int16: its Sobel response is at most 4 * 8000 < 2^15
+
+
+def boundary_metrics(
+    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> dict[str, Float64[Tensor, " b"]]:
+    """All measures of this file with their published settings.
+
+    Args:
+        pred_m: predicted depth [m], finite where valid.
+        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
+        valid: True where the truth is measured.
+
+    Returns:
+        The measures named in :data:`BOUNDARY_NAMES`, in that order; NaN where the truth has no such edge.
+    """
+    slopes = _squared_slopes(pred_m, target_m, valid)
+    values: dict[str, Tensor] = {}
+    for threshold in EDGE_THRESHOLDS:
+        scores = _edge_scores(*slopes, threshold)
+        values |= {f"edge_{name}_{threshold}": score for name, score in scores.items()}
+    values["si_boundary_f1"] = si_boundary_f1(pred_m, target_m, valid)
+    distances = depth_boundary_errors(pred_m, target_m, valid)
+    return values | {f"dbe_{name}": distance for name, distance in distances.items()}
+
+
+def edge_scores(
+    pred_m: Float[Tensor, "b 1 h w"],
+    target_m: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    threshold: float,
+) -> dict[str, Float64[Tensor, " b"]]:
+    """Precision, recall and F1 of predicted edge pixels (Hu et al. 2019).
+
+    An edge pixel is one where sqrt(fx^2 + fy^2) > threshold, fx and fy the plain 3 x 3 Sobel sums of depth in
+    metres (weights 1 2 1, not divided by 8): a step of s metres along an axis gives 4 s, so the thresholds 0.25, 0.5
+    and 1 find steps above 6, 12.5 and 25 cm. Only pixels whose whole 3 x 3 window lies in the image and is valid
+    count; the authors' code pads with zeros, so that the image's frame is an edge in truth and prediction alike.
+
+    Args:
+        pred_m: predicted depth [m].
+        target_m: ground-truth depth [m]; ignored where not valid.
+        valid: True where the truth is measured.
+        threshold: the Sobel magnitude [m] above which a pixel is an edge.
+
+    Returns:
+        ``precision``, ``recall`` and ``f1`` = 2 hits / (predicted + true), in [0, 1]. All are 0 if the truth has edges
+        and the prediction none, and NaN if the truth has none.
+    """
+    return _edge_scores(*_squared_slopes(pred_m, target_m, valid), threshold)
+
+
+def si_boundary_f1(
+    pred_m: Float[Tensor, "b 1 h w"],
+    target_m: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    min_ratio: float = 1.05,
+    max_ratio: float = 1.25,
+    steps: int = 10,
+) -> Float64[Tensor, " b"]:
+    """Scale-invariant boundary F1 (Bochkovskii et al. 2024, section 3.2).
+
+    A pixel occludes its left, right, upper or lower neighbour at threshold t if that is more than t times as deep. At
+    each t, precision and recall of the occlusions of each direction are averaged over the directions, F1 is their
+    harmonic mean (0 if both are 0), and the result is the mean of F1 over ``steps`` evenly spaced t, weighted with t.
+    Pairs with an invalid pixel do not count; a prediction below :data:`~hudepth.metrics.depth.MIN_DEPTH_M` counts as
+    that. Only there does the scale of the prediction matter.
+
+    The authors' code scores 0 for a direction or a threshold without any occlusion, so that even the truth itself
+    can stay below 1. Here a direction counts for recall where the truth has occlusions, for precision where either
+    has, and a threshold counts where the truth has. Where the truth has all directions at all thresholds,
+    both give the same number.
+
+    Args:
+        pred_m: predicted depth [m], up to a factor; finite where valid.
+        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
+        valid: True where the truth is measured.
+        min_ratio: least threshold, at least 1.
+        max_ratio: largest threshold.
+        steps: how many thresholds.
+
+    Returns:
+        Values in [0, 1]; NaN if the truth has no occlusion at ``min_ratio``.
+    """
+    ratios = torch.linspace(min_ratio, max_ratio, steps, dtype=torch.float64, device=pred_m.device)
+    pred, target = (torch.where(valid, full_precision(x).clamp_min(MIN_DEPTH_M), 1.0) for x in (pred_m, target_m))
+    counts = [_occlusions(pred, target, valid, ratios, dim=dim) for dim in (-1, -2)]
+    hits, predicted, true = torch.cat(counts, dim=2).double()  # each [b, 4 directions, steps]
+    recall = _mean_where(true > 0, hits / true, dim=1)
+    precision = _mean_where(true + predicted > 0, hits / predicted.clamp_min(1), dim=1)
+    f1 = (2 * precision * recall / (precision + recall)).nan_to_num()
+    weights: Tensor = ratios * (true.sum(dim=1) > 0)
+    mean: Tensor = (weights * f1).sum(dim=1) / weights.sum(dim=1)
+    return mean
+
+
+def depth_boundary_errors(
+    pred_m: Float[Tensor, "b 1 h w"],
+    target_m: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    *,
+    sigma_px: float = 2**0.5,
+    low: float = 0.15,
+    high: float = 0.3,
+    reach_px: float = 10.0,
+) -> dict[str, Float64[Tensor, " b"]]:
+    """Depth boundary errors (Koch et al. 2018), from exact Euclidean distances between edge pixels.
+
+    acc_px: mean distance from a predicted edge pixel to the nearest true one, over those nearer than ``reach_px``;
+        ``reach_px`` if there is none, the benchmark's penalty.
+    comp_px: mean, over predicted and true edge pixels together, of the distance to the nearest of the other kind, at
+        most ``reach_px``; so ``reach_px`` if nothing is predicted.
+
+    Edges are those of Canny's detector with the benchmark's settings: depth scaled to [0, 1] by its own least and
+    largest valid value, a Gaussian of ``sigma_px``, thresholds on the plain 3 x 3 Sobel magnitude. The benchmark
+    compares with annotated occlusions; here the true edges are those the same detector finds in the true depth.
+
+    Invalid pixels have no weight in the Gaussian, and no gradient is taken across them. Edges within 2 pixels of one
+    are dropped: there the detector cannot tell an edge from the end of what was measured.
+
+    Args:
+        pred_m: predicted depth [m], finite where valid.
+        target_m: ground-truth depth [m]; ignored where not valid.
+        valid: True where the truth is measured.
+        sigma_px: standard deviation of the Gaussian.
+        low: Sobel magnitude, of depth in [0, 1], down to which an edge is followed.
+        high: Sobel magnitude above which an edge begins.
+        reach_px: distance from which an edge counts as missed.
+
+    Returns:
+        ``acc_px`` in [0, reach_px] and ``comp_px`` in [0, reach_px]; NaN if the truth has no edge. They live where
+        ``pred_m`` does, though computed on the CPU.
+    """
+    rows = []
+    maps = (x.detach().squeeze(1).float().cpu().numpy() for x in (pred_m, target_m))
+    for pred, target, mask in zip(*maps, valid.squeeze(1).cpu().numpy(), strict=True):
+        edges = (canny_edges(x, mask, sigma_px=sigma_px, low=low, high=high) for x in (pred, target))
+        rows.append(chamfer_px(*edges, reach_px=reach_px))
+    values = torch.tensor(rows, dtype=torch.float64, device=pred_m.device).reshape(-1, 2)
+    return {"acc_px": values[:, 0], "comp_px": values[:, 1]}
+
+
+def _squared_slopes(pred_m: Tensor, target_m: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """fx^2 + fy^2 [m^2] of both maps, without the border; 0 where a window holds an invalid pixel."""
+    rows = valid[..., :-2, :] & valid[..., 1:-1, :] & valid[..., 2:, :]
+    whole = rows[..., :-2] & rows[..., 1:-1] & rows[..., 2:]
+    slopes = (_squared_sobel(torch.where(valid, full_precision(x), 0.0)) for x in (pred_m, target_m))
+    pred, target = (torch.where(whole, slope, 0.0) for slope in slopes)
+    return pred, target
+
+
+def _squared_sobel(x: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 rows columns"]:
+    smooth = x[..., :-2, :] + 2 * x[..., 1:-1, :] + x[..., 2:, :]
+    across = smooth[..., 2:] - smooth[..., :-2]
+    smooth = x[..., :-2] + 2 * x[..., 1:-1] + x[..., 2:]
+    down = smooth[..., 2:, :] - smooth[..., :-2, :]
+    return across.square() + down.square()
+
+
+def _edge_scores(pred: Tensor, target: Tensor, threshold: float) -> dict[str, Tensor]:
+    """Scores from squared slopes."""
+    predicted, true = pred > threshold**2, target > threshold**2
+    hits, claims, edges = (mask.sum(dim=(1, 2, 3)).double() for mask in (predicted & true, predicted, true))
+    scores = {"precision": hits / claims.clamp_min(1), "recall": hits / edges, "f1": 2 * hits / (claims + edges)}
+    return {name: torch.where(edges > 0, score, torch.nan) for name, score in scores.items()}
+
+
+def _occlusions(
+    pred: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    valid: Bool[Tensor, "b 1 h w"],
+    ratios: Float64[Tensor, " steps"],
+    *,
+    dim: int,
+) -> Int64[Tensor, "3 b 2 steps"]:
+    """Count hits, predicted and true occlusions between neighbours along ``dim``, both ways, at each ratio."""
+    size = valid.shape[dim] - 1
+    pairs = [(x.narrow(dim, 0, size), x.narrow(dim, 1, size)) for x in (pred, target, valid)]
+    steep = [torch.maximum(a, b) / torch.minimum(a, b) for a, b in pairs[:2]]
+    # few neighbours differ by the least ratio: only those are looked at more closely
+    kept = (pairs[2][0] & pairs[2][1]) & (torch.maximum(*steep) > ratios[0].item())
+    at = kept.flatten().nonzero()[:, 0]
+    image = at // kept[0].numel()
+    (p_passed, p_way), (t_passed, t_way) = (
+        (torch.bucketize(ratio.flatten()[at], ratios.to(ratio.dtype)), (a < b).flatten()[at].long())
+        for ratio, (a, b) in zip(steep, pairs[:2], strict=True)
+    )
+    both = torch.where(p_way == t_way, torch.minimum(p_passed, t_passed), 0)
+    counts = []
+    for passed, way in ((both, t_way), (p_passed, p_way), (t_passed, t_way)):
+        bins = (image * 2 + way) * (len(ratios) + 1) + passed  # passed: how many ratios are exceeded
+        counts.append(bins.bincount(minlength=len(pred) * 2 * (len(ratios) + 1)).view(len(pred), 2, -1))
+    return torch.stack(counts).flip(-1).cumsum(-1).flip(-1)[..., 1:]
+
+
+def _mean_where(mask: Tensor, x: Tensor, *, dim: int) -> Tensor:
+    return torch.where(mask, x, 0.0).sum(dim=dim) / mask.sum(dim=dim)
+
+
+def canny_edges(
+    depth: NDArray[np.float32], valid: NDArray[np.bool_], *, sigma_px: float, low: float, high: float
+) -> NDArray[np.bool_]:
+    """Edge pixels of a depth map [h, w], as :func:`depth_boundary_errors` says. Invalid pixels may hold anything."""
+    if not valid.any():
+        return np.zeros_like(valid)
+    least, largest = depth.min(where=valid, initial=np.inf), depth.max(where=valid, initial=-np.inf)
+    measured = valid.astype(np.float32)
+    unit = (np.where(valid, depth, least) - least) / max(largest - least, np.finfo(np.float32).tiny)
+    smooth, weight = (cv2.GaussianBlur(x, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) for x in (unit, measured))
+    levels = np.rint(smooth * _CANNY_SCALE / np.maximum(weight, 1e-6)).astype(np.int16)
+    window = np.ones((3, 3), np.uint8)
+    whole = cv2.erode(valid.astype(np.uint8), window)
+    across, down = (cv2.Sobel(levels, cv2.CV_16S, *axes) * whole for axes in ((1, 0), (0, 1)))
+    edges = cv2.Canny(across, down, low * _CANNY_SCALE, high * _CANNY_SCALE, L2gradient=True)
+    # a gradient cut off at the mask has a maximum there, which is no edge
+    return np.asarray((edges > 0) & (cv2.erode(whole, window) > 0))
+
+
+def chamfer_px(pred: NDArray[np.bool_], target: NDArray[np.bool_], *, reach_px: float) -> tuple[float, float]:
+    """acc_px and comp_px of :func:`depth_boundary_errors` between two edge maps [h, w]."""
+    if not target.any():
+        return np.nan, np.nan
+    if not pred.any():
+        return reach_px, reach_px
+    to_target, to_pred = _nearest_px(pred, target), _nearest_px(target, pred)
+    near = to_target[to_target < reach_px]
+    accuracy = near.mean() if near.size else reach_px
+    apart = np.minimum(np.concatenate([to_target, to_pred]), reach_px)
+    return float(accuracy), float(apart.mean())
+
+
+def _nearest_px(edges: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Distance of each edge pixel to the nearest of the others."""
+    distances = cv2.distanceTransform((~others).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # squared distances are whole numbers; OpenCV's last bit depends on where the array lies in memory
+    return np.sqrt(np.rint(np.square(distances[edges].astype(np.float64))))

@@ -1,0 +1,183 @@
+"""Where a depth network errs: by depth, by distance to a depth edge, by image region, by scene category.
+
+Each group parts the valid pixels of an image; sums over a bin add up over images, and metrics of a bin are pooled over
+its pixels.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hudepth.masked import full_precision
+from hudepth.metrics.depth import DELTAS, MIN_DEPTH_M
+
+DEPTH_EDGES_M = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
+"""Between bins of true depth; a depth on an edge lies in the farther bin."""
+EDGE_DISTANCES_PX = (2.0, 5.0, 10.0, 20.0, 40.0)
+"""Between bins of distance to the nearest depth edge, in pixels of the truth that is scored."""
+EDGE_RATIO = 1.1
+"""Two neighbours form a depth edge where one is over this many times as far as the other."""
+_SIDES = (("top", "middle", "bottom"), ("left", "centre", "right"))
+
+
+def _labels(edges: Sequence[float], unit: str) -> list[str]:
+    low = (0.0, *edges)
+    return [*(f"{a:g}-{b:g} {unit}" for a, b in zip(low, edges, strict=False)), f"{edges[-1]:g} {unit} and more"]
+
+
+STRATA: tuple[tuple[str, str], ...] = (
+    *(("depth", label) for label in _labels(DEPTH_EDGES_M, "m")),
+    *(("edge distance", label) for label in _labels(EDGE_DISTANCES_PX, "px")),
+    *(("region", f"{row} {column}") for row in _SIDES[0] for column in _SIDES[1]),
+)
+"""Group and label of each bin, in order."""
+STRATUM_SUMS = ("count", "abs_rel", "squared", "absolute", "delta1")
+"""Columns of :func:`strata_sums`; the first is in pixels."""
+MAX_CATEGORIES = 12
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """What a network reaches on a part of the pixels."""
+
+    group: str
+    label: str
+    images: int
+    """How many images have a pixel of it."""
+    share: float
+    """Of the group's pixels, in [0, 1]."""
+    abs_rel: float
+    rmse: float
+    """[m]"""
+    mae: float
+    """[m]"""
+    delta1: float
+
+
+def strata_sums(
+    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> Float64[Tensor, "b bins 5"]:
+    """Sum errors over each bin of :data:`STRATA`, image by image.
+
+    Args:
+        pred_m: predicted depth [m].
+        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
+        valid: which pixels count.
+
+    Returns:
+        Columns as in :data:`STRATUM_SUMS`.
+    """
+    pred, target = (torch.where(valid, full_precision(x), 1.0) for x in (pred_m, target_m))
+    error = (pred - target).abs()
+    positive = pred.clamp_min(MIN_DEPTH_M)
+    close = torch.maximum(positive / target, target / positive) < DELTAS[0]
+    terms = torch.stack([error / target, error.square(), error, close.to(error.dtype)], dim=-1).flatten(1, -2)
+    rows = []
+    for image, (mask, depth) in enumerate(zip(valid[:, 0].cpu().numpy(), target[:, 0].cpu().numpy(), strict=True)):
+        counted = torch.from_numpy(np.flatnonzero(mask)).to(terms.device)
+        values = terms[image, counted].double()
+        rows.append(_binned(_bins(depth, mask)[:, counted.cpu()].to(terms.device), values))
+    return torch.stack(rows)
+
+
+def _binned(bins: Int[Tensor, "groups n"], values: Float64[Tensor, "n k"]) -> Float64[Tensor, "bins k1"]:
+    sums = values.new_zeros(len(STRATA), len(STRATUM_SUMS))
+    for index in bins:
+        sums[:, 0] += torch.bincount(index, minlength=len(STRATA))
+        for column in range(values.shape[1]):
+            sums[:, 1 + column] += torch.bincount(index, weights=values[:, column], minlength=len(STRATA))
+    return sums
+
+
+def _bins(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> Int[Tensor, "groups n"]:
+    """Return the bin of each pixel in each group, [3, h * w]."""
+    height, width = depth_m.shape
+    by_depth = np.searchsorted(DEPTH_EDGES_M, depth_m.ravel(), side="right")
+    by_distance = np.searchsorted(EDGE_DISTANCES_PX, edge_distance_px(depth_m, valid).ravel(), side="right")
+    rows, columns = (3 * np.arange(size) // size for size in (height, width))
+    by_region = (3 * rows[:, None] + columns).ravel()
+    first_distance = len(DEPTH_EDGES_M) + 1
+    first_region = first_distance + len(EDGE_DISTANCES_PX) + 1
+    return torch.from_numpy(np.stack([by_depth, first_distance + by_distance, first_region + by_region]))
+
+
+def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return each pixel's distance to the nearest pixel at a depth edge, [h, w].
+
+    A pixel is at an edge where it and a valid neighbour above, below or beside it differ by more than
+    :data:`EDGE_RATIO`. Infinite if the image has no edge, which puts it in the last bin.
+    """
+    log = np.log(np.where(valid, depth_m, 1.0))
+    edge = np.zeros(depth_m.shape, np.bool_)
+    for a, b in (
+        ((slice(1, None),), (slice(None, -1),)),
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+    ):
+        step = (np.abs(log[a] - log[b]) > np.log(EDGE_RATIO)) & valid[a] & valid[b]
+        edge[a] |= step
+        edge[b] |= step
+    if not edge.any():
+        return np.full(depth_m.shape, np.inf, np.float32)
+    return np.asarray(cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+
+
+def summarise_strata(sums: Float64[Tensor, "n bins 5"], categories: Sequence[str]) -> list[Stratum]:
+    """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels.
+
+    Args:
+        sums: of :func:`strata_sums`, a row an image.
+        categories: kind of scene of each image, empty where unknown.
+
+    Returns:
+        Bins without a pixel are left out. The group ``category`` stands last, if any category is known: at most
+        :data:`MAX_CATEGORIES`, most pixels first, the rest as ``other``.
+    """
+    rows = [(*STRATA[i], sums[:, i]) for i in range(len(STRATA))]
+    if any(categories):
+        # any group will do: each adds up to all valid pixels
+        whole = sums[:, : len(DEPTH_EDGES_M) + 1].sum(dim=1)
+        rows += [("category", label, whole[members]) for label, members in _by_category(whole[:, 0], categories)]
+    pixels: dict[str, float] = {}
+    for group, _, part in rows:
+        pixels[group] = pixels.get(group, 0.0) + part[:, 0].sum().item()
+    strata = []
+    for group, label, part in rows:
+        count, abs_rel, squared, absolute, delta1 = part.sum(dim=0).tolist()
+        if count:
+            strata.append(
+                Stratum(
+                    group=group, label=label, images=int((part[:, 0] > 0).sum()), share=count / pixels[group],
+                    abs_rel=abs_rel / count, rmse=(squared / count) ** 0.5, mae=absolute / count, delta1=delta1 / count,
+                )
+            )  # fmt: skip
+    return strata
+
+
+def _by_category(pixels: Float64[Tensor, " n"], categories: Sequence[str]) -> list[tuple[str, list[int]]]:
+    members: dict[str, list[int]] = {}
+    for image, category in enumerate(categories):
+        members.setdefault(category or "unknown", []).append(image)
+    ordered = sorted(members.items(), key=lambda item: -pixels[item[1]].sum().item())
+    if len(ordered) <= MAX_CATEGORIES:
+        return ordered
+    shown, rest = ordered[: MAX_CATEGORIES - 1], ordered[MAX_CATEGORIES - 1 :]
+    return [*shown, ("other", [image for _, images in rest for image in images])]
+
+
+def strata_csv(rows: Sequence[Stratum]) -> str:
+    """Return the rows as CSV, under the names of :class:`Stratum`'s fields."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([field.name for field in fields(Stratum)])
+    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)] for row in rows)
+    return text.getvalue()

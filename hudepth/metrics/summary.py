@@ -1,0 +1,160 @@
+"""From the metrics of each image to those of a set of images, without their pixels.
+
+Over images: the mean of the images' metrics. Pooled, over all pixels at once, with n_i pixels of image i that count:
+
+    mean metrics (abs_rel, sq_rel, mse, log10, mae, delta_k)   sum n_i x_i / sum n_i
+    rmse, rmse_log                                             sqrt(sum n_i x_i^2 / sum n_i)
+    silog   factor * sqrt(rmse_log^2 - lambda * log_bias^2), both pooled; log_bias is the mean of ln p - ln t
+
+So a metric of any set follows from columns that add up over images (:func:`additive`), which is also what resampling
+needs. The metrics themselves are defined in :mod:`hudepth.metrics.depth`, with which pooling agrees.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hudepth.errors import DataError
+
+Floats = NDArray[np.float64]
+
+LOG_BIAS = "log_bias"
+"""Mean of ln p - ln t: no metric, but pooled silog follows from it."""
+DEPTH_NAMES = (
+    "abs_rel", "sq_rel", "mse", "rmse", "rmse_log", "log10", "silog", "mae", "delta1", "delta2", "delta3", LOG_BIAS,
+)  # fmt: skip
+"""Defined for every image that has a pixel; others, like ssim, may be undefined (NaN) for some images."""
+SQUARED = ("rmse", "rmse_log")
+"""Pooled as squares."""
+KEYS = ("id", "scene", "category", "pixels")
+"""First columns of per_image.csv."""
+
+
+@dataclass(frozen=True)
+class ImageTable:
+    """Metrics of each image of a set, a row an image."""
+
+    ids: list[str]
+    """Unique."""
+    scenes: list[str]
+    """Empty where the data set names none."""
+    categories: list[str]
+    pixels: NDArray[np.int64]
+    """[n] pixels that count."""
+    values: dict[str, Floats]
+    """[n] by metric; NaN where undefined."""
+
+
+def summarise(
+    table: ImageTable, *, averaging: str, silog_lambda: float = 1.0, silog_factor: float = 100.0
+) -> dict[str, float]:
+    """Return the metrics of all images of a table together.
+
+    Args:
+        table: of the images.
+        averaging: ``image`` or ``pooled``. Metrics that are undefined for some images, like ssim, are in either case
+            averaged over the images where they are defined.
+        silog_lambda: of pooled silog, as in :func:`hudepth.metrics.depth.depth_metrics_from_sums`.
+        silog_factor: the same.
+
+    Returns:
+        The metrics of the table, without ``log_bias``; pooled silog only if the table has ``log_bias``. Images without
+        a pixel that counts are skipped. NaN where a prediction was NaN (skipping it would flatter), and where a metric
+        is defined for no image.
+    """
+    sums = {name: column.sum(axis=1, keepdims=True) for name, column in additive(table, averaging=averaging).items()}
+    metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
+    return {name: value.item() for name, value in metrics.items()}
+
+
+def additive(table: ImageTable, *, averaging: str) -> dict[str, Floats]:
+    """Return what adds up over images: for each name [2, n], weighted values and their weights."""
+    columns = {}
+    for name, values in table.values.items():
+        pooled = averaging == "pooled" and name in DEPTH_NAMES
+        weights = (table.pixels if pooled else table.pixels > 0).astype(np.float64)
+        if name not in DEPTH_NAMES:
+            weights[np.isnan(values)] = 0
+        terms = weights * (values**2 if pooled and name in SQUARED else values)
+        columns[name] = np.stack([np.where(weights > 0, terms, 0), weights])
+    return columns
+
+
+def metrics_from_sums(
+    sums: Mapping[str, Floats], *, averaging: str, silog_lambda: float, silog_factor: float
+) -> dict[str, Floats]:
+    """Turn sums of :func:`additive` columns, [2, *] by name, into metrics, [*] by name; NaN where a weight is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        means = {name: terms / weights for name, (terms, weights) in sums.items()}
+        bias = means.pop(LOG_BIAS, None)
+        if averaging == "pooled":
+            if means.pop("silog", None) is not None and bias is not None and "rmse_log" in means:
+                variance = means["rmse_log"] - silog_lambda * bias**2
+                means["silog"] = silog_factor * np.sqrt(np.maximum(variance, 0))  # rounding can leave less than 0
+            means |= {name: np.sqrt(means[name]) for name in SQUARED if name in means}
+    return means
+
+
+def per_image_csv(table: ImageTable) -> str:
+    """Return per_image.csv: id, scene, category, pixels, then the metrics with 9 significant digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*KEYS, *table.values])
+    keys = zip(table.ids, table.scenes, table.categories, table.pixels.tolist(), strict=True)
+    for row, (image, scene, category, pixels) in enumerate(keys):
+        numbers = (f"{values[row]:.9g}" for values in table.values.values())
+        writer.writerow([image, scene, category, pixels, *numbers])
+    return text.getvalue()
+
+
+def read_per_image(path: Path) -> ImageTable:
+    """Read what :func:`per_image_csv` wrote.
+
+    Raises:
+        DataError: if the file is missing or damaged; the message names file and line.
+    """
+    again = "Run hudepth-test again."
+    rows: dict[str, list[str]] = {}
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.reader(file)
+            names = next(reader, [])
+            if tuple(names[: len(KEYS)]) != KEYS or len(set(names)) != len(names) or len(names) == len(KEYS):
+                raise DataError(f"'{path}', line 1: no header {', '.join(KEYS)} and then metrics. {again}")
+            for cells in reader:
+                where = f"'{path}', line {reader.line_num}"
+                if len(cells) != len(names):
+                    raise DataError(f"{where}: {len(cells)} values under {len(names)} names. {again}")
+                if cells[0] in rows:
+                    raise DataError(f"{where}: a second row of image '{cells[0]}'. {again}")
+                _check_numbers(cells, names, where=where, mend=again)
+                rows[cells[0]] = cells
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"'{path}' cannot be read as a table of images ({error}). {again}") from error
+    if not rows:
+        raise DataError(f"'{path}' holds no image. {again}")
+    ids, scenes, categories, pixels, *values = (list(column) for column in zip(*rows.values(), strict=True))
+    return ImageTable(
+        ids=ids,
+        scenes=scenes,
+        categories=categories,
+        pixels=np.array([int(count) for count in pixels], dtype=np.int64),
+        values={name: np.array([float(x) for x in c]) for name, c in zip(names[len(KEYS) :], values, strict=True)},
+    )
+
+
+def _check_numbers(cells: list[str], names: list[str], *, where: str, mend: str) -> None:
+    if not cells[3].isascii() or not cells[3].isdigit():
+        raise DataError(f"{where}: pixels '{cells[3]}' is no count. {mend}")
+    for name, cell in zip(names[len(KEYS) :], cells[len(KEYS) :], strict=True):
+        try:
+            float(cell)
+        except ValueError:
+            raise DataError(f"{where}: {name} '{cell}' is no number. {mend}") from None

@@ -1,0 +1,1 @@
+"""The paper: what it states, and how each statement is checked."""

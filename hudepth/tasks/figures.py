@@ -1,0 +1,50 @@
+"""hudepth-report figures: the paper's figures 5 and 6 of any run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hudepth.callbacks import evenly_spaced, make_panels
+from hudepth.checkpoint import load_checkpoint
+from hudepth.console import log
+from hudepth.errors import ConfigError, HudepthError
+from hudepth.run_dir import is_run, newest_run
+from hudepth.tasks.test import open_data
+from hudepth.viz.curves import read_history, save_curves
+from hudepth.viz.panels import save_panels
+
+
+def figures(config: dict[str, Any]) -> None:
+    """Draw the curves of the total loss and of each term, and panels of RGB, truth, prediction and error.
+
+    The panels need the run's checkpoint and its data. Where one is missing, the curves are drawn all the same.
+
+    Args:
+        config: with ``run``, ``panels``, ``data``, ``output``, ``paths`` and ``trust``.
+
+    Raises:
+        HudepthError: if there is no run or no history of it.
+    """
+    run = newest_run(config["paths"]["runs"]) if config["run"] == "last" else Path(str(config["run"])).expanduser()
+    if not is_run(run):
+        raise ConfigError(f"run: '{run}' is no run directory. Pass run=<runs/name/date_time>, or run=last.")
+    output = Path(config["output"]) if config["output"] else run / "figures"
+    save_curves(
+        output / "curves.png", read_history(run / "metrics.csv"), title=f"{run.parent.name}: loss and raw terms"
+    )
+    log.info("total loss and each term, by epoch: %s", (output / "curves.png").resolve())
+    if not config["panels"]:
+        return
+    try:
+        checkpoint = load_checkpoint(str(run))
+        typed = {"cache": config["paths"]["cache"], **config["data"]}
+        datamodule, _ = open_data(checkpoint, typed, overrides=[], trust=config["trust"])
+        shown = evenly_spaced(sorted(datamodule.split.test), config["panels"])
+        net = checkpoint.build_net(trust=config["trust"])
+        panels = make_panels(net, datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
+    except HudepthError as error:
+        log.warning("no panels: %s", error)
+        return
+    save_panels(output / "panels.png", panels)
+    log.info("RGB, truth, prediction and error of %d test images: %s", len(panels), (output / "panels.png").resolve())

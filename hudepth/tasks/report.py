@@ -1,0 +1,37 @@
+"""hudepth-report: what runs say, side by side and beside the paper."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from hudepth.cli import VERBS
+from hudepth.errors import ConfigError, did_you_mean
+from hudepth.tasks.common import plain
+
+
+def report(cfg: DictConfig) -> None:
+    """Run the verb ``compare``, ``figures`` or ``paper``.
+
+    Args:
+        cfg: what conf/report.yaml and the command line compose to.
+
+    Raises:
+        HudepthError: with one line for the user.
+    """
+    config = plain(cfg)
+    verb = config["verb"]
+    if verb == "compare":
+        from hudepth.tasks.compare import compare
+
+        compare(config)
+    elif verb == "figures":
+        from hudepth.tasks.figures import figures
+
+        figures(config)
+    elif verb == "paper":
+        from hudepth.tasks.paper import paper
+
+        paper(config)
+    else:
+        hint = did_you_mean(str(verb), VERBS["report"])
+        raise ConfigError(f"verb: no '{verb}'.{hint} Use hudepth-report {' or '.join(VERBS['report'])}.")

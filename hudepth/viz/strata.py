@@ -1,0 +1,61 @@
+"""Errors by depth, distance to an edge, region and category: a plot a group."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hudepth.metrics.strata import Stratum
+from hudepth.viz.panels import save_figure
+
+RARE = 0.01
+"""A bin with a smaller share of its group's pixels is drawn pale and does not set the scale."""
+
+
+def draw_strata(rows: Sequence[Stratum], *, title: str = "") -> Figure:
+    """Draw abs_rel of each bin as a bar, the bin's share of the pixels beside its name.
+
+    Args:
+        rows: bins of any number of groups, those of a group together; at least one.
+        title: above the figure.
+    """
+    groups = [[row for row in rows if row.group == group] for group in dict.fromkeys(row.group for row in rows)]
+    lines = -(-len(groups) // 2)
+    heights = [max(len(group) for group in groups[2 * i : 2 * i + 2]) + 2.5 for i in range(lines)]
+    figure = Figure(figsize=(9.6, 0.27 * sum(heights) + 0.5), dpi=110, layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    axes = figure.subplots(lines, 2, squeeze=False, sharex=True, gridspec_kw={"height_ratios": heights}).ravel()
+    common = [row.abs_rel for row in rows if row.share >= RARE] or [row.abs_rel for row in rows]
+    for axis, group in zip(axes, groups, strict=False):
+        _draw_group(axis, group, right=1.18 * max(common))
+    for axis in axes[len(groups) :]:
+        axis.set_axis_off()
+    return figure
+
+
+def _draw_group(axis: Axes, rows: Sequence[Stratum], *, right: float) -> None:
+    for place, row in enumerate(rows):
+        axis.barh(place, row.abs_rel, height=0.72, color="tab:blue", alpha=1 if row.share >= RARE else 0.35)
+        # a bar that leaves the picture carries its number inside
+        end, side = (row.abs_rel, "left") if row.abs_rel < 0.9 * right else (right, "right")
+        axis.annotate(f" {row.abs_rel:.3f} ", (end, place), ha=side, va="center", fontsize=8)
+    labels = [f"{row.label.replace('_', ' ')}   {_percent(row.share)}" for row in rows]
+    axis.set_yticks(range(len(rows)), labels, fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlim(0, right)
+    axis.set_title(f"by {rows[0].group}: abs_rel, and share of the pixels", fontsize=9, loc="left")
+    axis.tick_params(labelbottom=True, axis="x", labelsize=8)
+    axis.grid(axis="x", alpha=0.3)
+    axis.set_axisbelow(True)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= RARE else "< 1 %"
+
+
+def save_strata(path: Path, rows: Sequence[Stratum], *, title: str = "") -> None:
+    """Write :func:`draw_strata` as a PNG file."""
+    save_figure(path, draw_strata(rows, title=title))
