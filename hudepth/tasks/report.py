@@ -23,7 +23,10 @@ def report(cfg: DictConfig) -> None:
     if verb == "compare":
         from hudepth.tasks.compare import compare
 
-        compare(config)
+        names = [name for name, protocol in (config["protocol"] or {}).items() if protocol]
+        if len(names) != 1:
+            raise ConfigError(f"protocol: compare takes one, not {len(names)}. Pass protocol=eigen.")
+        compare({**config, "protocol": names[0]})
     elif verb == "figures":
         from hudepth.tasks.figures import figures
 
