@@ -3,13 +3,13 @@
 Frames of a scene resemble each other, so they are not independent draws; scenes are. Each repeat draws as many scenes
 as there are, with replacement, and takes the metrics of all their frames. The interval lies between two percentiles of
 the repeats, moved outwards for few scenes as if their mean followed Student's t (the expanded percentile interval of
-Hesterberg 2015, What teachers should know about the bootstrap, section 5.3):
+Hesterberg 2015, What teachers should know about the bootstrap):
 
     p = Phi(-sqrt(n / (n - 1)) * t_(n - 1)),  n scenes, t the quantile that leaves (1 - level) / 2 above it
 
 In 8000 simulated sets of normal scene effects as large as the frames' own scatter, five frames a scene on average,
-intervals of 95 % held the truth in 91.5 % of sets of 5 scenes, 94.7 % of 12 and 94.1 % of 40 (not moved: 82.9 %, 91.0 %
-and 93.1 %; images resampled one by one: about 70 %). With log-normal errors it was 93 % at 12 scenes.
+intervals of 95 % held the truth in 91.5 % of sets of 5 scenes, 94.5 % of 12 and 94.3 % of 40 (not moved: 82.9 %, 91.1 %
+and 93.3 %; images resampled one by one: about 70 %). With log-normal errors it was 93 % at 12 scenes.
 
 An interval says how much a result depends on which scenes were tested, not on the seed a network was trained with.
 """

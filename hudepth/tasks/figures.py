@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hudepth.callbacks import evenly_spaced, make_panels
-from hudepth.checkpoint import load_checkpoint
+from hudepth.callbacks import evenly_spaced
 from hudepth.console import log
 from hudepth.errors import ConfigError, HudepthError
 from hudepth.run_dir import is_run, newest_run
-from hudepth.tasks.test import open_data
+from hudepth.tasks.pictures import run_panels
 from hudepth.viz.curves import read_history, save_curves
 from hudepth.viz.panels import save_panels
 
@@ -37,12 +36,9 @@ def figures(config: dict[str, Any]) -> None:
     if not config["panels"]:
         return
     try:
-        checkpoint = load_checkpoint(str(run))
-        typed = {"cache": config["paths"]["cache"], **config["data"]}
-        datamodule, _ = open_data(checkpoint, typed, overrides=[], trust=config["trust"])
-        shown = evenly_spaced(sorted(datamodule.split.test), config["panels"])
-        net = checkpoint.build_net(trust=config["trust"])
-        panels = make_panels(net, datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
+        panels = run_panels(
+            run, lambda datamodule: evenly_spaced(sorted(datamodule.split.test), config["panels"]), config=config
+        )
     except HudepthError as error:
         log.warning("no panels: %s", error)
         return

@@ -10,7 +10,7 @@ from hudepth.tasks.common import plain
 
 
 def report(cfg: DictConfig) -> None:
-    """Run the verb ``compare``, ``figures`` or ``paper``.
+    """Run the verb ``compare``, ``table``, ``figures`` or ``paper``.
 
     Args:
         cfg: what conf/report.yaml and the command line compose to.
@@ -19,14 +19,17 @@ def report(cfg: DictConfig) -> None:
         HudepthError: with one line for the user.
     """
     config = plain(cfg)
-    verb = config["verb"]
+    verb, protocols = config["verb"], [name for name, protocol in (config["protocol"] or {}).items() if protocol]
     if verb == "compare":
         from hudepth.tasks.compare import compare
 
-        names = [name for name, protocol in (config["protocol"] or {}).items() if protocol]
-        if len(names) != 1:
-            raise ConfigError(f"protocol: compare takes one, not {len(names)}. Pass protocol=eigen.")
-        compare({**config, "protocol": names[0]})
+        if len(protocols) != 1:
+            raise ConfigError(f"protocol: compare takes one, not {len(protocols)}. Pass protocol=eigen.")
+        compare({**config, "protocol": protocols[0]})
+    elif verb == "table":
+        from hudepth.tasks.table import table
+
+        table({**config, "protocol": protocols})
     elif verb == "figures":
         from hudepth.tasks.figures import figures
 
