@@ -231,6 +231,22 @@ def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
     return a.table, other
 
 
+def common_images(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
+    """Return the images that both results are of, in the order of the first, as of two splits of one set.
+
+    Raises:
+        DataError: if protocol or data differ, or they share no image.
+    """
+    lines = [line for line in stamp_differences(a, b) if not line.startswith("split.")]
+    if lines:
+        raise DataError(f"'{a.path}' and '{b.path}' do not compare: {_first(lines)}. Test both with the same settings.")
+    position = {image: row for row, image in enumerate(b.table.ids)}
+    rows = [row for row, image in enumerate(a.table.ids) if image in position]
+    if not rows:
+        raise DataError(f"'{a.path}' and '{b.path}' share no test image.")
+    return _take(a.table, rows), _take(b.table, [position[a.table.ids[row]] for row in rows])
+
+
 def _take(table: ImageTable, rows: Sequence[int]) -> ImageTable:
     return replace(
         table,

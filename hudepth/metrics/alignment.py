@@ -54,7 +54,7 @@ def align(
 
 def _median(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
     # the mean of the two middle values, as numpy's: torch.median takes the lower
-    middle_p, middle_t = (x.quantile(0.5) if x.numel() < 2**24 else x.median() for x in (p, t))
+    middle_p, middle_t = ((x.kthvalue((len(x) + 1) // 2)[0] + x.kthvalue(len(x) // 2 + 1)[0]) / 2 for x in (p, t))
     return pred * (middle_t / middle_p) if middle_p > 0 else pred
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -44,6 +45,10 @@ STRATA: tuple[tuple[str, str], ...] = (
 STRATUM_SUMS = ("count", "abs_rel", "squared", "absolute", "delta1")
 """Columns of :func:`strata_sums`; the first is in pixels."""
 MAX_CATEGORIES = 12
+_SIZES = (len(DEPTH_EDGES_M) + 1, len(EDGE_DISTANCES_PX) + 1, 9)
+"""Bins of each group."""
+_CELLS = math.prod(_SIZES)
+"""Combinations of a bin of each group."""
 
 
 @dataclass(frozen=True)
@@ -81,34 +86,34 @@ def strata_sums(
     error = (pred - target).abs()
     positive = pred.clamp_min(MIN_DEPTH_M)
     close = torch.maximum(positive / target, target / positive) < DELTAS[0]
-    terms = torch.stack([error / target, error.square(), error, close.to(error.dtype)], dim=-1).flatten(1, -2)
-    rows = []
+    terms = [error / target, error.square(), error, close]
+    index = np.empty((len(valid), target[0].numel()), np.int64)
     for image, (mask, depth) in enumerate(zip(valid[:, 0].cpu().numpy(), target[:, 0].cpu().numpy(), strict=True)):
-        counted = torch.from_numpy(np.flatnonzero(mask)).to(terms.device)
-        values = terms[image, counted].double()
-        rows.append(_binned(_bins(depth, mask)[:, counted.cpu()].to(terms.device), values))
-    return torch.stack(rows)
+        index[image] = np.where(mask, _cells(depth, mask), _CELLS).ravel()
+    index += (_CELLS + 1) * np.arange(len(index))[:, None]
+    return _binned(torch.from_numpy(index).to(error.device), terms)
 
 
-def _binned(bins: Int[Tensor, "groups n"], values: Float64[Tensor, "n k"]) -> Float64[Tensor, "bins k1"]:
-    sums = values.new_zeros(len(STRATA), len(STRATUM_SUMS))
-    for index in bins:
-        sums[:, 0] += torch.bincount(index, minlength=len(STRATA))
-        for column in range(values.shape[1]):
-            sums[:, 1 + column] += torch.bincount(index, weights=values[:, column], minlength=len(STRATA))
-    return sums
+def _binned(index: Int[Tensor, "b n"], terms: Sequence[Shaped[Tensor, "b 1 h w"]]) -> Float64[Tensor, "b bins k"]:
+    """Sum over cells, then over the cells of each bin: one pass over the pixels serves all groups."""
+    weights = [None, *(term.double().flatten() for term in terms)]
+    size = len(index) * (_CELLS + 1)
+    sums = torch.stack([torch.bincount(index.flatten(), w, minlength=size).double() for w in weights], dim=-1)
+    cells = sums.reshape(len(index), _CELLS + 1, -1)[:, :_CELLS].reshape(len(index), *_SIZES, -1)
+    return torch.cat([cells.sum(dim=others) for others in ((2, 3), (1, 3), (1, 2))], dim=1)
 
 
-def _bins(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> Int[Tensor, "groups n"]:
-    """Return the bin of each pixel in each group, [3, h * w]."""
+def _cells(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.int16]:
+    """Return which combination of a bin of each group every pixel lies in, [h, w]."""
     height, width = depth_m.shape
-    by_depth = np.searchsorted(DEPTH_EDGES_M, depth_m.ravel(), side="right")
-    by_distance = np.searchsorted(EDGE_DISTANCES_PX, edge_distance_px(depth_m, valid).ravel(), side="right")
     rows, columns = (3 * np.arange(size) // size for size in (height, width))
-    by_region = (3 * rows[:, None] + columns).ravel()
-    first_distance = len(DEPTH_EDGES_M) + 1
-    first_region = first_distance + len(EDGE_DISTANCES_PX) + 1
-    return torch.from_numpy(np.stack([by_depth, first_distance + by_distance, first_region + by_region]))
+    cells: NDArray[np.int16] = (3 * rows[:, None] + columns).astype(np.int16)
+    for edge in DEPTH_EDGES_M:
+        cells += np.int16(_SIZES[1] * _SIZES[2]) * (depth_m >= edge)
+    distance_px = edge_distance_px(depth_m, valid)
+    for edge in EDGE_DISTANCES_PX:
+        cells += np.int16(_SIZES[2]) * (distance_px >= edge)
+    return cells
 
 
 def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -117,13 +122,12 @@ def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> 
     A pixel is at an edge where it and a valid neighbour above, below or beside it differ by more than
     :data:`EDGE_RATIO`. Infinite if the image has no edge, which puts it in the last bin.
     """
-    log = np.log(np.where(valid, depth_m, 1.0))
     edge = np.zeros(depth_m.shape, np.bool_)
     for a, b in (
         ((slice(1, None),), (slice(None, -1),)),
         ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
     ):
-        step = (np.abs(log[a] - log[b]) > np.log(EDGE_RATIO)) & valid[a] & valid[b]
+        step = ((depth_m[a] > EDGE_RATIO * depth_m[b]) | (depth_m[b] > EDGE_RATIO * depth_m[a])) & valid[a] & valid[b]
         edge[a] |= step
         edge[b] |= step
     if not edge.any():

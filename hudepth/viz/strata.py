@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,9 +29,10 @@ def draw_strata(rows: Sequence[Stratum], *, title: str = "") -> Figure:
     figure = Figure(figsize=(9.6, 0.27 * sum(heights) + 0.5), dpi=110, layout="constrained")
     figure.suptitle(title, fontsize=11)
     axes = figure.subplots(lines, 2, squeeze=False, sharex=True, gridspec_kw={"height_ratios": heights}).ravel()
-    common = [row.abs_rel for row in rows if row.share >= RARE] or [row.abs_rel for row in rows]
+    finite = [row for row in rows if math.isfinite(row.abs_rel)]
+    common = [row.abs_rel for row in finite if row.share >= RARE] or [row.abs_rel for row in finite]
     for axis, group in zip(axes, groups, strict=False):
-        _draw_group(axis, group, right=1.18 * max(common))
+        _draw_group(axis, group, right=1.18 * max(common, default=0) or 1.0)
     for axis in axes[len(groups) :]:
         axis.set_axis_off()
     return figure
@@ -38,9 +40,11 @@ def draw_strata(rows: Sequence[Stratum], *, title: str = "") -> Figure:
 
 def _draw_group(axis: Axes, rows: Sequence[Stratum], *, right: float) -> None:
     for place, row in enumerate(rows):
-        axis.barh(place, row.abs_rel, height=0.72, color="tab:blue", alpha=1 if row.share >= RARE else 0.35)
+        # no bar where it is NaN or infinite, but the number
+        length = row.abs_rel if math.isfinite(row.abs_rel) else 0.0
+        axis.barh(place, length, height=0.72, color="tab:blue", alpha=1 if row.share >= RARE else 0.35)
         # a bar that leaves the picture carries its number inside
-        end, side = (row.abs_rel, "left") if row.abs_rel < 0.9 * right else (right, "right")
+        end, side = (length, "left") if length < 0.9 * right else (right, "right")
         axis.annotate(f" {row.abs_rel:.3f} ", (end, place), ha=side, va="center", fontsize=8)
     labels = [f"{row.label.replace('_', ' ')}   {_percent(row.share)}" for row in rows]
     axis.set_yticks(range(len(rows)), labels, fontsize=8)
