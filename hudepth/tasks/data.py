@@ -1,4 +1,4 @@
-"""hudepth-data: prepare a depth store, or show what is known of a data set."""
+"""hudepth-data: prepare a depth store, show what is known of a data set, or audit it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from rich.table import Table
 from hudepth.data.prepare import store_path
 from hudepth.data.splits import SUBSETS, make_split
 from hudepth.errors import ConfigError, DataError
+from hudepth.tasks.audit import audit
 from hudepth.tasks.common import build_data, plain
 
 
 def data(cfg: DictConfig) -> None:
-    """Run the verb ``prepare`` or ``info``.
+    """Run the verb ``prepare``, ``info`` or ``audit``.
 
     Args:
         cfg: what conf/data.yaml and the command line compose to.
@@ -29,8 +30,13 @@ def data(cfg: DictConfig) -> None:
         store = datamodule.store
         print(f"{len(store)} pairs in {store.path}")
         return
+    if config["verb"] == "audit":
+        audit(config, datamodule)
+        return
     if config["verb"] != "info":
-        raise ConfigError(f"verb: no '{config['verb']}'. Use hudepth-data prepare or hudepth-data info.")
+        raise ConfigError(
+            f"verb: no '{config['verb']}'. Use hudepth-data prepare, hudepth-data info or hudepth-data audit."
+        )
     source = datamodule.source
     records = source.records()
     table = Table(title=f"{source.name}", show_header=False, title_justify="left")
