@@ -9,16 +9,15 @@ history, and writes the table of results between the markers of the Markdown fil
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import sys
 from pathlib import Path
 
+from hudepth.files import write_between
 from hudepth.viz.curves import read_history, save_curves
 
 KEPT = ("config.yaml", "overrides.txt", "environment.json", "split.json", "status.json", "metrics.csv")
 SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")
-MARKER = "<!-- results -->"
 
 
 def table(metrics: dict[str, dict[str, float]]) -> str:
@@ -45,10 +44,7 @@ def main(run: Path, study: Path, *documents: Path) -> None:
 
     metrics = json.loads((study / "test" / "eigen" / "metrics.json").read_text())["metrics"]
     for document in (study / "README.md", *documents):
-        text = document.read_text(encoding="utf-8")
-        pattern = rf"{MARKER}\n.*?{MARKER}\n"
-        assert re.search(pattern, text, re.DOTALL), f"{document} needs two lines {MARKER}"
-        document.write_text(re.sub(pattern, f"{MARKER}\n{table(metrics)}\n{MARKER}\n", text, flags=re.DOTALL))
+        write_between(document, "results", table(metrics))
 
 
 if __name__ == "__main__":

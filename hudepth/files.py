@@ -40,6 +40,19 @@ def write_text(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def write_between(path: Path, marker: str, text: str) -> None:
+    """Replace what a UTF-8 file holds between two lines ``<!-- marker -->``: for tables that programs write.
+
+    Raises:
+        ValueError: if there are not two such lines.
+    """
+    line = f"<!-- {marker} -->\n"
+    parts = path.read_text(encoding="utf-8").split(line)
+    if len(parts) != 3:
+        raise ValueError(f"'{path}' needs two lines '{line.strip()}' and has {len(parts) - 1}.")
+    write_text(path, line.join([parts[0], f"{text.strip()}\n", parts[2]]))
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as indented JSON, whole or not at all.
 

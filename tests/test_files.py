@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.files import write_json, write_text, written_whole
+from hudepth.files import write_between, write_json, write_text, written_whole
 
 
 def names(folder: Path) -> list[str]:
@@ -119,3 +119,14 @@ def test_json_has_no_word_for_nan(tmp_path: Path, value: float) -> None:
         write_json(tmp_path / "a.json", {"rmse": value})
     assert json.loads((tmp_path / "a.json").read_text()) == {"rmse": 0.5}
     assert names(tmp_path) == ["a.json"]
+
+
+def test_writing_between_markers_leaves_the_rest(tmp_path: Path) -> None:
+    path = tmp_path / "page.md"
+    path.write_text("# title\n<!-- a -->\nold\nlines\n<!-- a -->\nend, äö\n<!-- b -->\n<!-- b -->\n", encoding="utf-8")
+    write_between(path, "a", "\nnew \\1\n")
+    write_between(path, "b", "| x |")
+    expected = "# title\n<!-- a -->\nnew \\1\n<!-- a -->\nend, äö\n<!-- b -->\n| x |\n<!-- b -->\n"
+    assert path.read_text(encoding="utf-8") == expected
+    with pytest.raises(ValueError, match=r"needs two lines '<!-- c -->' and has 0\.$"):
+        write_between(path, "c", "x")

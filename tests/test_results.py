@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from hudepth.errors import DataError
-from hudepth.metrics.summary import per_image_csv
-from hudepth.results import Result, find_result, merge, paired, stamp_differences
+from hudepth.metrics.summary import ImageTable, per_image_csv
+from hudepth.results import Result, common_images, find_result, merge, paired, stamp_differences
 
 STUDY = Path(__file__).parents[1] / "experiments" / "badcl_official"
 FINGERPRINT = "d22e3bd4"
@@ -291,3 +291,36 @@ def test_rows_marked_with_what_differs(eigen: Result) -> None:
         "data": ["nyu_labeled", "rooms", "nyu_labeled"],
         "split": ["official", "official", "random"],
     }
+
+
+def test_common_images_of_two_splits(eigen: Result) -> None:
+    ids = eigen.table.ids
+    half = replace(eigen, table=_rows(eigen, list(range(300, 654))[::-1]))
+    half = with_document(half, split__sha256="0" * 64, split__kind="random")
+    ours, theirs = common_images(replace(eigen, table=_rows(eigen, list(range(400)))), half)
+    assert ours.ids == theirs.ids == ids[300:400]
+    assert (ours.values["rmse"] == eigen.table.values["rmse"][300:400]).all()
+    assert (theirs.values["rmse"] == ours.values["rmse"]).all()
+    assert theirs.scenes == eigen.table.scenes[300:400]
+
+
+def test_common_images_must_compare(eigen: Result) -> None:
+    one = replace(eigen, table=_rows(eigen, [0, 1]))
+    other = replace(eigen, table=_rows(eigen, [2, 3]))
+    assert message(lambda: common_images(one, other)).endswith("share no test image.")
+    changed = with_document(other, protocol__crop=None)
+    assert "do not compare: protocol.crop: [45,471,41,601] against none." in message(
+        lambda: common_images(one, changed)
+    )
+
+
+def _rows(result: Result, rows: list[int]) -> ImageTable:
+    table = result.table
+    return replace(
+        table,
+        ids=[table.ids[i] for i in rows],
+        scenes=[table.scenes[i] for i in rows],
+        categories=[table.categories[i] for i in rows],
+        pixels=table.pixels[rows],
+        values={name: values[rows] for name, values in table.values.items()},
+    )

@@ -12,11 +12,10 @@ writes the table between the markers of README.md beside this file, and <name>.j
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 
-from hudepth.files import write_json, write_text
+from hudepth.files import write_between, write_json
 from hudepth.metrics.bootstrap import describe, intervals, paired_differences, unpaired_differences
 from hudepth.metrics.summary import summarise
 from hudepth.results import Result, common_images, find_result
@@ -81,14 +80,7 @@ def main(random_run: Path, disjoint_run: Path, name: str) -> None:
     random, disjoint = (find_result(run, "eigen") for run in (random_run, disjoint_run))
     rows = compare(random, disjoint)
     write_json(HERE / f"{name}.json", {"rows": rows, "protocol": random.stamp, "data": random.data})
-    readme = HERE / "README.md"
-    marker = f"<!-- {name} -->"
-    text = readme.read_text(encoding="utf-8")
-    assert text.count(marker) == 2, f"README.md needs two lines {marker}"
-    filled = re.sub(
-        rf"{marker}\n.*?{marker}\n", f"{marker}\n{table(rows, random, disjoint)}\n{marker}\n", text, flags=re.DOTALL
-    )
-    write_text(readme, filled)
+    write_between(HERE / "README.md", name, table(rows, random, disjoint))
     print(json.dumps(rows, indent=1))
 
 
