@@ -30,7 +30,9 @@ def align(
     """Return the predictions, each aligned to its truth over its valid pixels.
 
     An image without a valid pixel is returned as it is. A prediction that is constant where valid has no scale to
-    fit: it is shifted. A median of 0 or less cannot be scaled and is returned as it is.
+    fit: it is shifted. A median of 0 or less cannot be scaled and is returned as it is. A NaN or infinite prediction
+    at a valid pixel stays one, and may spread over its image: a fit to it means nothing. ``least_squares`` may answer
+    0 m and less.
 
     Args:
         pred_m: predicted depth [m].
@@ -66,7 +68,8 @@ def _least_squares(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
 def _affine_inverse(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
     scale, shift = _line(1 / p.clamp_min(_MIN_DEPTH_M), 1 / t)
     inverse = scale / pred.clamp_min(_MIN_DEPTH_M) + shift
-    return 1 / inverse.clamp_min(1 / MAX_DEPTH_M)
+    # an infinite prediction has the inverse 0, which would pass for a depth
+    return torch.where(pred.isfinite(), 1 / inverse.clamp_min(1 / MAX_DEPTH_M), torch.nan)
 
 
 def _line(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

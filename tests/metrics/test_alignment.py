@@ -215,3 +215,32 @@ def test_unknown_kind(kind: str, hint: str) -> None:
         align(*make_case(), kind=kind)
     expected = f"alignment: no '{kind}'.{hint} Pass one of none, median, least_squares, affine_inverse."
     assert str(caught.value) == expected
+
+
+@given(seed=st.integers(0, 1000), scale=st.floats(-10, -0.1), shift=st.floats(-3, 3))
+def test_least_squares_undoes_a_negative_scale(seed: int, scale: float, shift: float) -> None:
+    rng = np.random.default_rng(seed)
+    pred, target = (torch.tensor(rng.uniform(0.5, 10, (2, 1, 6, 7))) for _ in range(2))
+    valid = torch.tensor(rng.random(pred.shape) > 0.2)
+    before, after = (align(x, target, valid, kind="least_squares") for x in (pred, scale * pred + shift))
+    torch.testing.assert_close(after, before, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("constant", [0.1, 0.3, 2.7])
+@pytest.mark.parametrize("count", range(3, 60))
+def test_rounding_noise_of_a_constant_is_no_slope(constant: float, count: int) -> None:
+    rng = np.random.default_rng(count)
+    target = torch.tensor(rng.uniform(1, 9, (1, 1, 1, count)))
+    pred = torch.full_like(target, constant)
+    pred[..., 0], valid = 1.0, torch.ones_like(target, dtype=torch.bool)
+    valid[..., 0] = False  # scored where the fit did not look, a slope made of noise shows
+    aligned = align(pred, target, valid, kind="least_squares")
+    assert aligned[0, 0, 0, 0].item() == pytest.approx(target[valid].mean().item() + 1.0 - constant)
+
+
+def test_an_infinite_prediction_is_not_hidden() -> None:
+    pred, target = torch.full((1, 1, 2, 3), 2.0), torch.full((1, 1, 2, 3), 3.0)
+    pred[..., 0, 0] = math.inf
+    for kind in ALIGNMENTS[1:]:
+        aligned = align(pred, target, torch.ones_like(pred, dtype=torch.bool), kind=kind)
+        assert not aligned[0, 0, 0, 0].isfinite(), kind

@@ -280,3 +280,20 @@ def test_csv_has_the_fields_and_rounds_to_six_digits() -> None:
     assert header == ["group", "label", "images", "share", "abs_rel", "rmse", "mae", "delta1"]
     assert row == ["category", 'a, "b"', "3", "0.333333", "0.1", "0.25", "1", "0.987654"]
     assert strata_csv([]) == ",".join(header) + "\n"
+
+
+@given(seed=st.integers(0, 1000))
+def test_depth_of_zero_or_less_is_never_close(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    target = torch.tensor(rng.uniform(0.5, 10, (2, 1, 6, 7))).float()
+    pred, valid = target * torch.tensor(rng.uniform(-1.2, 1.2, target.shape)).float(), torch.ones_like(target).bool()
+    torch.testing.assert_close(
+        strata_sums(pred, target, valid)[:, :7, 4].sum(1), depth_sums(pred, target, valid)["delta1"]
+    )
+
+
+def test_half_precision_of_both_is_summed_in_full() -> None:
+    rng = np.random.default_rng(0)
+    pred, target = (torch.tensor(rng.uniform(0.5, 10, (1, 1, 30, 70))).bfloat16() for _ in range(2))
+    valid = torch.ones_like(target).bool()
+    assert strata_sums(pred, target, valid).equal(strata_sums(pred.float(), target.float(), valid))

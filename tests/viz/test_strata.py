@@ -106,3 +106,21 @@ def test_odd_errors_are_drawn_all_the_same(abs_rel: float) -> None:
     axes = draw_strata(rows).axes
     assert [text.get_text().strip() for axis in axes for text in axis.texts] == [f"{abs_rel:.3f}"] * 2
     assert all(axis.get_xlim()[0] == 0 < axis.get_xlim()[1] < np.inf for axis in axes if axis.axison)
+
+
+def test_the_number_of_a_bar_beyond_the_scale_lies_inside() -> None:
+    bins = [("0-1 m", 5.0, 0.001), ("1-2 m", 0.1, 0.999), ("2-3 m", 0.112, 0.001)]
+    figure = draw_strata([Stratum("depth", n, 5, s, a, 0.5, 0.3, 0.9) for n, a, s in bins])
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    axis = figure.axes[0]
+    inside = axis.get_window_extent(canvas.get_renderer())
+    for text in axis.texts:
+        box = text.get_window_extent(canvas.get_renderer())
+        assert inside.x0 <= box.x0
+        assert box.x1 <= inside.x1
+
+
+def test_where_all_are_rare_they_set_the_scale() -> None:
+    axis = draw_strata([Stratum("depth", "0-1 m", 5, 0.001, 5.0, 0.5, 0.3, 0.9)]).axes[0]
+    assert axis.get_xlim()[1] > 5
