@@ -170,7 +170,9 @@ def _config_line(error: BaseException, task: str) -> str | None:
             if key.startswith("trainer.")
             else ""
         )
-        return f"no key '{key}'.{did_you_mean(key, known_keys(task))} See hudepth-{task} --cfg job for all keys.{plus}"
+        known = known_keys(task)
+        hint = "" if key in known else did_you_mean(key, known)  # a group, but of another task
+        return f"no key '{key}'.{hint} See hudepth-{task} --cfg job for all keys.{plus}"
     if "Override" in type(error).__name__ or module == "antlr4" or "NoViableAlt" in text:
         typed = getattr(error, "override", None) or text.split(": ", 1)[-1]
         return f"cannot read '{typed}': write key=value, and quote values with special characters: 'key=\"a, b\"'."
@@ -197,8 +199,11 @@ def known_keys(task: str) -> list[str]:
 
     GlobalHydra.instance().clear()
     with initialize_config_module("hudepth.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose(task, overrides=_chosen_groups()), resolve=False)
-    keys = list(_dotted(config))
+        try:
+            config = compose(task, overrides=_chosen_groups())
+        except Exception:  # a group chosen that this task does not have, which may be the very mistake
+            config = compose(task)
+    keys = list(_dotted(OmegaConf.to_container(config, resolve=False)))
     return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
 
 

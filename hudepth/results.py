@@ -112,7 +112,7 @@ def _read(folder: Path) -> Result:
     again = "Run hudepth-test again."
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"'{path}' cannot be read ({error}). {again}") from error
     lacking = next((key for key in _NEEDED if not _has(document, key)), None)
     if lacking:

@@ -24,6 +24,8 @@ def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
         ("train", ["model.headz=3"], "no key 'model.headz'. Did you mean 'model.attention_heads'? See"),
         ("train", ["trainer.max_epoch=3"], "no key 'trainer.max_epoch'. Did you mean 'trainer.max_epochs'? See"),
         ("train", ["loss=silog", "loss.variance_focuss=1"], "no key 'loss.variance_focuss'. Did you mean "),
+        ("test", ["checkpoint=x", "model=hybrid_unet"], "no key 'model'. See hudepth-test --cfg job for all keys."),
+        ("report", ["figures", "data=rooms"], "no key 'data'. See hudepth-report --cfg job for"),
         ("train", ["lss=l1"], "no key 'lss'. Did you mean 'loss'? See"),
         ("train", ["data=nyu_labelled"], "data: no 'nyu_labelled'. Did you mean 'nyu_labeled'? Pass one of de"),
         ("train", ["experiment=badcll"], "experiment: no 'badcll'. Did you mean 'badcl'? Pass one of badcl, demo."),

@@ -6,6 +6,9 @@ means nothing. :meth:`Protocol.stamp` is what a metric file says.
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypedDict
@@ -86,15 +89,16 @@ class Protocol:
         ):
             if value not in choices:
                 raise ConfigError(
-                    f"protocol.{self.name}.{key}: no '{value}'.{did_you_mean(value, choices)} "
+                    f"protocol.{self.name}.{key}: no '{value}'.{did_you_mean(str(value), choices)} "
                     f"Pass one of {', '.join(choices)}."
                 )
+        self._check_kinds()
         size = self.crop_size
-        if size is not None and (len(size) != 2 or min(size) < 1):
-            raise ConfigError(f"protocol.{self.name}.crop_size: {list(size)} is not [height,width].")
-        if self.crop is not None and not _is_crop(self.crop, size):
-            within = f" within {list(size)}" if size else ""
-            raise ConfigError(f"protocol.{self.name}.crop: {list(self.crop)} is not [top,bottom,left,right]{within}.")
+        if size is not None and (not _are_pixels(size, 2) or min(size) < 1):
+            raise ConfigError(f"protocol.{self.name}.crop_size: {_spelt(size)} is not [height,width].")
+        if self.crop is not None and not (_are_pixels(self.crop, 4) and _is_crop(self.crop, size)):
+            within = f" within {_spelt(size)}" if size else ""
+            raise ConfigError(f"protocol.{self.name}.crop: {_spelt(self.crop)} is not [top,bottom,left,right]{within}.")
         if self.min_depth_m < 0:
             raise ConfigError(f"protocol.{self.name}.min_depth_m: {self.min_depth_m} is negative.")
         if self.max_depth_m is not None and self.max_depth_m <= self.min_depth_m:
@@ -103,6 +107,24 @@ class Protocol:
             raise ConfigError(f"protocol.{self.name}.silog_lambda: {self.silog_lambda} is not in [0, 1].")
         if self.ssim_data_range_m <= 0 or self.ssim_window < 1:
             raise ConfigError(f"protocol.{self.name}: ssim_data_range_m and ssim_window must be positive.")
+
+    def _check_kinds(self) -> None:
+        name = self.name
+        if not re.fullmatch(r"\w[\w.+-]*", str(name)):  # its results lie in a folder of that name
+            raise ConfigError(f"protocol: '{name}' is no name for a folder. Pass a word, as protocol.eigen.name=mine.")
+        for key in ("flip", "clamp", "boundary", "strata"):
+            if not isinstance(getattr(self, key), bool):
+                raise ConfigError(f"protocol.{name}.{key}: '{getattr(self, key)}' is neither true nor false.")
+        for key in ("min_depth_m", "max_depth_m", "silog_lambda", "silog_factor", "ssim_data_range_m"):
+            value = getattr(self, key)
+            if not (_is_finite(value) or (key == "max_depth_m" and value is None)):
+                raise ConfigError(f"protocol.{name}.{key}: '{value}' is no finite number.")
+        try:
+            json.dumps({**self.extra}, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"protocol.{name}.extra: '{self.extra}' cannot be written as a JSON object.") from error
+        if not _are_pixels([self.ssim_window], 1):
+            raise ConfigError(f"protocol.{name}.ssim_window: '{self.ssim_window}' is no whole number of pixels.")
 
     @property
     def needs_native(self) -> bool:
@@ -128,14 +150,15 @@ class Protocol:
         return within if self.max_depth_m is None else within & above(truth_m, self.max_depth_m)
 
     def window(self, height: int, width: int) -> tuple[slice, slice] | None:
-        """Return the rows and columns that count in an image of this size; None if the crop exceeds it."""
+        """Return the rows and columns that count in an image of this size; None if the crop exceeds it or none do."""
         if self.crop is None:
             return slice(0, height), slice(0, width)
         top, bottom, left, right = self.crop
         if self.crop_size is None:
             return (slice(top, bottom), slice(left, right)) if bottom <= height and right <= width else None
         y, x = height / self.crop_size[0], width / self.crop_size[1]
-        return slice(round(top * y), round(bottom * y)), slice(round(left * x), round(right * x))
+        top, bottom, left, right = round(top * y), round(bottom * y), round(left * x), round(right * x)
+        return (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
 
     def stamp(self) -> dict[str, Any]:
         """Return all that decides the numbers, for a metric file."""
@@ -169,8 +192,20 @@ class Protocol:
         return f"measured, {self.min_depth_m:.15g} m {less} truth{upper}"
 
 
+def _is_finite(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_pixels(values: object, count: int) -> bool:
+    return isinstance(values, (list, tuple)) and len(values) == count and all(type(value) is int for value in values)
+
+
+def _spelt(values: object) -> str:
+    return str(list(values) if isinstance(values, tuple) else values)
+
+
 def _is_crop(crop: Sequence[int], size: Sequence[int] | None) -> bool:
-    if len(crop) != 4 or not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
+    if not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
         return False
     return size is None or (crop[1] <= size[0] and crop[3] <= size[1])
 

@@ -106,13 +106,14 @@ class Scored:
 
     def _variant(self, protocol: Protocol) -> tuple[object, ...]:
         """Name the prediction that protocols share: those that align or change nothing by clamping get the same."""
-        clamps = protocol.clamp and not self._cache.get(("inside", protocol.caps[1:]), lambda: self._inside(protocol))
-        aligned = (protocol.alignment, protocol.crop and tuple(protocol.crop), protocol.caps)
-        return (None if protocol.alignment == "none" else aligned, protocol.caps[1:] if clamps else None)
+        limits = protocol.caps[1:]
+        if protocol.alignment != "none":
+            seen = (tuple(key or ()) for key in (protocol.crop, protocol.crop_size))
+            return (protocol.alignment, *seen, protocol.caps), limits if protocol.clamp else None
+        clamps = protocol.clamp and not self._cache.get(("inside", limits), lambda: self._inside(protocol))
+        return None, limits if clamps else None
 
     def _inside(self, protocol: Protocol) -> bool:
-        if protocol.alignment != "none":
-            return False
         low, high = protocol.min_depth_m, protocol.max_depth_m
         least, most = (x.item() for x in self.pred_m.aminmax())
         return low <= least and (high is None or most <= high)

@@ -151,7 +151,7 @@ def read_per_image(path: Path) -> ImageTable:
 
 
 def _check_numbers(cells: list[str], names: list[str], *, where: str, mend: str) -> None:
-    if not cells[3].isascii() or not cells[3].isdigit():
+    if not cells[3].isascii() or not cells[3].isdigit() or len(cells[3]) > 18:  # what 64 bits hold
         raise DataError(f"{where}: pixels '{cells[3]}' is no count. {mend}")
     for name, cell in zip(names[len(KEYS) :], cells[len(KEYS) :], strict=True):
         try:

@@ -66,10 +66,10 @@ class Run:
     def training_images(self) -> int | None:
         """Size of the training subset, None where no test result states it."""
         for test in self.tests.values():
-            trained_on = (test.get("checkpoint") or {}).get("trained_on") or {}
-            counts = (trained_on.get("split") or test.get("split") or {}).get("counts") or {}
-            if isinstance(counts.get("train"), int):
-                return int(counts["train"])
+            trained_on = _at(test, "checkpoint", "trained_on", "split") or test.get("split")
+            count = _at(trained_on, "counts", "train")
+            if isinstance(count, int):
+                return count
         return None
 
     def tested_source(self, protocol: str) -> str:
@@ -82,12 +82,12 @@ class Run:
 
     def metric(self, protocol: str, name: str) -> float | None:
         """Return a test metric of the trained network, None where there is none."""
-        value = self.tests.get(protocol, {}).get("metrics", {}).get(MODEL, {}).get(name)
+        value = _at(self.tests, protocol, "metrics", MODEL, name)
         return float(value) if _is_number(value) else None
 
     def interval(self, protocol: str, name: str) -> tuple[float, float] | None:
         """Return the interval of a test metric [low, high], None where the result states none."""
-        ends = self.tests.get(protocol, {}).get("intervals", {}).get(MODEL, {}).get(name)
+        ends = _at(self.tests, protocol, "intervals", MODEL, name)
         if isinstance(ends, list) and len(ends) == 2 and all(map(_is_number, ends)):
             return float(ends[0]), float(ends[1])
         return None
@@ -160,7 +160,7 @@ def read_result(file: Path) -> dict[str, Any]:
     again = "Run hudepth-test on that run again."
     try:
         result: Any = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"'{file}' cannot be read ({type(error).__name__}). {again}") from error
     metrics = result.get("metrics") if isinstance(result, dict) else None
     if not isinstance(metrics, dict) or not isinstance(metrics.get(MODEL), dict):
@@ -201,6 +201,13 @@ def pairs(runs: Sequence[Run], *keys: str) -> list[tuple[Run, Run]]:
         for a, b in itertools.combinations(runs, 2)
         if a.config.get(keys[0]) != b.config.get(keys[0]) and same_but(a, b, *keys)
     ]
+
+
+def _at(value: object, *keys: str) -> Any:
+    """Look a nested value up, None where there is none."""
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
 
 
 def _is_number(value: object) -> bool:

@@ -66,9 +66,9 @@ def audit(config: dict[str, Any], datamodule: DepthDataModule) -> None:
         HudepthError: with one line for the user.
     """
     source = datamodule.source
-    output = Path(config["output"] or f"audit_{source.name}")
+    output = Path(config.get("output") or f"audit_{source.name}").expanduser()
     listed = source.records()
-    store = datamodule.store if _look_at_images(config["images"], datamodule, listed) else None
+    store, refused = _prepared(config.get("images", "auto"), datamodule, listed)
     records = store.records if store else listed  # pairs that were skipped are in no split
     scan = scan_store(store) if store else None
     kinds: dict[str, Audited | str] = {}
@@ -81,7 +81,7 @@ def audit(config: dict[str, Any], datamodule: DepthDataModule) -> None:
         copies = find_duplicates(split, scan.hashes, scan.digests) if scan else None
         kinds[kind] = Audited(split, leakage(records, split), copies)
     chosen = kinds[datamodule.split_kind]
-    findings = [_chosen_finding(datamodule.split_kind, chosen)]
+    findings = [_chosen_finding(datamodule.split_kind, chosen), *refused]
     leaks: list[dict[str, Any]] = []
     if store and scan:
         raw = sample_raw(source, listed)
@@ -89,10 +89,33 @@ def audit(config: dict[str, Any], datamodule: DepthDataModule) -> None:
         if isinstance(chosen, Audited):
             leaks = worst_leaks(records, chosen, scan.hashes)
     _print(source.name, len(records), kinds, datamodule.split_kind, findings)
-    write_json(output / "audit.json", _report(datamodule, records, kinds, findings, leaks, images=store is not None))
-    if store and leaks:
-        _draw(output / "leaks.png", store, leaks, kind=datamodule.split_kind)
+    report = _report(datamodule, records, kinds, findings, leaks, images=store is not None)
+    try:
+        write_json(output / "audit.json", report)
+        if store and leaks:
+            _draw(output / "leaks.png", store, leaks, kind=datamodule.split_kind)
+    except OSError as error:
+        raise ConfigError(f"output: cannot write '{output}' ({error.strerror}). Pass output=<a folder>.") from error
     print(f"written to {output}: audit.json" + (", leaks.png" if leaks else ""))
+
+
+def _prepared(
+    wanted: object, datamodule: DepthDataModule, records: Sequence[Record]
+) -> tuple[DepthStore | None, list[Finding]]:
+    """Return the store if images are to be looked at, or the finding that says why the set cannot be prepared.
+
+    Raises:
+        DataError: if ``wanted`` is True and the set cannot be prepared.
+    """
+    if not _look_at_images(wanted, datamodule, records):
+        return None, []
+    datamodule.on_error = "skip"  # bad pairs are what an audit is for: they are listed, the others are looked at
+    try:
+        return datamodule.store, []
+    except DataError as error:
+        if wanted != "auto":
+            raise
+        return None, [Finding("images and depth", "warning", "cannot be prepared", str(error), {})]
 
 
 def _look_at_images(wanted: object, datamodule: DepthDataModule, records: Sequence[Record]) -> bool:
@@ -104,11 +127,15 @@ def _look_at_images(wanted: object, datamodule: DepthDataModule, records: Sequen
             log.info("images left out: no duplicates, nothing on depth. Pass images=true to look at them.")
         return bool(wanted)
     source = datamodule.source
-    missing = next((file for file in source.files() if not file.exists()), None)
-    if missing:
+    files = source.files()
+    missing = [file for file in files if not file.exists()]
+    if len(missing) > len(files) / 2:  # a list without its files; a few lost ones are findings
         log.info(
-            "images left out: no file '%s'. Records tell what leaks by scene; duplicates and depth need all files.",
-            missing,
+            "images left out: %s of %s files are missing, the first '%s'. Records tell what leaks by scene; "
+            "for duplicates and depth, bring the files.",
+            f"{len(missing):,}",
+            f"{len(files):,}",
+            missing[0],
         )
         return False
     if len(records) <= SMALL:

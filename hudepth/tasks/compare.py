@@ -72,6 +72,11 @@ def _draw_images(path: Path, a: Result, b: Result, config: dict[str, Any]) -> No
     runs = {name: result.path.parent.parent for name, result in (("a", a), ("b", b))}
     if not config.get("panels") or not all((run / CHECKPOINTS).is_dir() for run in runs.values()):
         return
+    if not all(_of_training_data(result) for result in (a, b)):
+        log.warning(
+            "no images.png: tested on other data than that of the training, which is what runs know how to open"
+        )
+        return
     from hudepth.tasks.pictures import panels_beside  # torch and lightning, which only this picture needs
 
     try:
@@ -80,6 +85,13 @@ def _draw_images(path: Path, a: Result, b: Result, config: dict[str, Any]) -> No
         log.warning("no images.png: %s", error)
         return
     save_panels(path, panels)
+
+
+def _of_training_data(result: Result) -> bool:
+    trained_on = result.document.get("checkpoint")
+    for key in ("trained_on", "fingerprint"):
+        trained_on = trained_on.get(key) if isinstance(trained_on, dict) else None
+    return bool(trained_on == result.data["fingerprint"])
 
 
 def _count(config: dict[str, Any], key: str, default: int, *, least: int) -> int:

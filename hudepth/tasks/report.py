@@ -19,6 +19,8 @@ def report(cfg: DictConfig) -> None:
         HudepthError: with one line for the user.
     """
     config = plain(cfg)
+    if isinstance(config["runs"], str):  # runs=x as well as runs=[x]
+        config["runs"] = [config["runs"]]
     verb, protocols = config["verb"], [name for name, protocol in (config["protocol"] or {}).items() if protocol]
     if verb == "compare":
         from hudepth.tasks.compare import compare

@@ -65,15 +65,19 @@ def score_checkpoint(
     if not trainer.is_global_zero:
         return {}
     shared = _stamp(checkpoint, datamodule)
-    results = {
-        protocol.name: _write_results(output / protocol.name, protocol, evaluation, datamodule, shared)
-        for protocol in protocols
-    }
+    results, failed = {}, []
+    for protocol in protocols:
+        try:
+            results[protocol.name] = _write_results(output / protocol.name, protocol, evaluation, datamodule, shared)
+        except ConfigError as error:  # what the other protocols say is not lost
+            failed.append(error)
     if count := config.get("panels", 6):
         shown = evenly_spaced(evaluation.indices, count)
         panels = make_panels(predictors[MODEL], datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
-        for protocol in protocols:
-            save_panels(output / protocol.name / "panels.png", panels)
+        for name in results:
+            save_panels(output / name / "panels.png", panels)
+    if failed:
+        raise failed[0]
     log.info("tables and pictures: %s", output.resolve())
     return results
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from hudepth.files import written_whole
@@ -51,7 +52,7 @@ def draw_panels(panels: Sequence[Panel]) -> NDArray[np.uint8]:
     Returns:
         [H, W, 3] RGB.
     """
-    canvas: Any = FigureCanvasAgg(_figure(panels))
+    canvas: Any = FigureCanvasAgg(_literal(_figure(panels)))
     canvas.draw()
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
@@ -63,9 +64,16 @@ def save_panels(path: Path, panels: Sequence[Panel]) -> None:
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a figure as a PNG file, whole or not at all."""
-    FigureCanvasAgg(figure)
+    FigureCanvasAgg(_literal(figure))
     with written_whole(path) as part:
         figure.savefig(part, format="png")
+
+
+def _literal(figure: Figure) -> Figure:
+    """Show names as they are written: between two dollar signs matplotlib reads a formula, and fails if it is none."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    return figure
 
 
 def _figure(panels: Sequence[Panel]) -> Figure:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from typing import Any
 
 import pytest
@@ -91,7 +92,7 @@ def test_whatever_changes_a_number_changes_the_stamp(field: str, value: object) 
 @given(
     st.builds(
         Protocol,
-        name=st.text(min_size=1),
+        name=st.from_regex(r"\w[\w.+-]*", fullmatch=True),
         resolution=st.sampled_from(["network", "native"]),
         crop=st.none() | st.just((45, 471, 41, 601)),
         min_depth_m=st.floats(0, 1),
@@ -169,12 +170,56 @@ def test_the_stamp_of_the_usual_benchmark() -> None:
         ({"silog_lambda": 1.5}, "protocol.x.silog_lambda: 1.5 is not in [0, 1]."),
         ({"ssim_window": 0}, "protocol.x: ssim_data_range_m and ssim_window must be positive."),
         ({"ssim_data_range_m": 0.0}, "protocol.x: ssim_data_range_m and ssim_window must be positive."),
+        ({"max_depth_m": math.inf}, "protocol.x.max_depth_m: 'inf' is no finite number."),
+        ({"silog_factor": math.nan}, "protocol.x.silog_factor: 'nan' is no finite number."),
+        (
+            {"extra": {"a": math.inf}},
+            "protocol.x.extra: '{'a': inf}' cannot be written as a JSON object.",
+        ),
     ],
 )
 def test_options_out_of_range(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         Protocol(name="x", **options)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("crop", 5, "protocol.x.crop: 5 is not [top,bottom,left,right] within [480, 640]."),
+        ("crop", [0.5, 9, 0, 9], "protocol.x.crop: [0.5, 9, 0, 9] is not [top,bottom,left,right] within [480, 640]."),
+        ("crop", [0, 9, 0, "a"], "protocol.x.crop: [0, 9, 0, 'a'] is not [top,bottom,left,right] within [480, 640]."),
+        ("crop_size", [1.5, 9], "protocol.x.crop_size: [1.5, 9] is not [height,width]."),
+        ("resize", 5, "protocol.x.resize: no '5'. Pass one of bilinear, bicubic, nearest."),
+        ("min_depth_m", None, "protocol.x.min_depth_m: 'None' is no finite number."),
+        ("max_depth_m", "ten", "protocol.x.max_depth_m: 'ten' is no finite number."),
+        ("ssim_window", 2.5, "protocol.x.ssim_window: '2.5' is no whole number of pixels."),
+        ("flip", "maybe", "protocol.x.flip: 'maybe' is neither true nor false."),
+        ("extra", 5, "protocol.x.extra: '5' cannot be written as a JSON object."),
+    ],
+)
+def test_options_of_another_kind(field: str, value: object, message: str) -> None:
+    protocol = Protocol(name="x")
+    object.__setattr__(protocol, field, value)  # as a configuration brings it, past the types that tests check
+    with pytest.raises(ConfigError) as caught:
+        protocol.__post_init__()
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", "/tmp/a", "a\\b", "a\n"])
+def test_a_name_is_that_of_a_folder(name: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Protocol(name=name)
+    assert str(caught.value) == (
+        f"protocol: '{name}' is no name for a folder. Pass a word, as protocol.eigen.name=mine."
+    )
+
+
+def test_a_crop_that_leaves_nothing_of_a_small_image() -> None:
+    protocol = Protocol(name="x", crop=[0, 1, 0, 640])
+    assert protocol.window(480, 640) == (slice(0, 1), slice(0, 640))
+    assert protocol.window(120, 160) is None
 
 
 def test_a_crop_in_plain_pixels_must_fit() -> None:

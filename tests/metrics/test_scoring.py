@@ -286,3 +286,42 @@ def test_truths_of_different_sizes() -> None:
     sums = score(Protocol(**EIGEN), pred_m, batch)
     counted = (other[0, 34:353, 32:470] > 1e-3) & (other[0, 34:353, 32:470] < 10)
     assert sums[1, 0].item() == counted.sum().item()
+
+
+MEASURED: dict[str, Any] = {"valid": "measured", "min_depth_m": 0.5, "max_depth_m": 5.0}
+LEAST_SQUARES: dict[str, Any] = {**MEASURED, "alignment": "least_squares"}
+
+
+@pytest.mark.parametrize(
+    "several",
+    [
+        [
+            {"alignment": "median", "crop": [0, 20, 0, 20]},
+            {"alignment": "median", "crop": [0, 20, 0, 20], "crop_size": None},
+        ],
+        [
+            {**MEASURED, "clamp": True},
+            {**LEAST_SQUARES, "clamp": True},
+            LEAST_SQUARES,
+        ],
+        [LEAST_SQUARES, {**LEAST_SQUARES, "valid": "closed"}, {**LEAST_SQUARES, "alignment": "affine_inverse"}],
+    ],
+)
+def test_protocols_in_one_pass_say_what_each_says_alone(several: list[dict[str, Any]]) -> None:
+    pred_m, batch = make_batch(1)
+    pred_m = pred_m.clamp(0.5, 5.0)  # so that clamping changes nothing, unless after alignment
+    protocols = [Protocol(name=f"p{i}", **options) for i, options in enumerate(several)]
+    together = BatchScores(pred_m, BatchTruth(batch, max_depth_m=10.0))
+    alone = [score(protocol, pred_m, batch) for protocol in protocols]
+    assert not torch.equal(alone[-2], alone[-1])
+    for protocol, expected in zip(protocols, alone, strict=True):
+        torch.testing.assert_close(together.sums(protocol), expected, rtol=0, atol=0, equal_nan=True)
+
+
+def test_an_image_of_which_the_crop_leaves_nothing_is_left_out() -> None:
+    pred_m, batch = make_batch(1)
+    protocol = Protocol(name="x", crop=[0, 1, 0, 640])
+    scores = BatchScores(pred_m, BatchTruth(batch, max_depth_m=10.0))
+    assert scores.sums(protocol)[0, 0] == 0
+    assert scores.boundary(protocol).isnan().all()
+    assert scores.strata(protocol).sum() == 0

@@ -187,6 +187,7 @@ AGAIN = "Run hudepth-test again."
         (HEADER + "0,s,c,9,0.1,0.2\n1,s,c,9,0.1\n", "', line 3: 5 values under 6 names."),
         (HEADER + "0,s,c,9,0.1,0.2\n\n", "', line 3: 0 values under 6 names."),
         (HEADER + "0,s,c,9.5,0.1,0.2\n", "', line 2: pixels '9.5' is no count."),
+        (HEADER + "0,s,c,99999999999999999999,0.1,0.2\n", "', line 2: pixels '99999999999999999999' is no count."),
         (HEADER + "0,s,c,-9,0.1,0.2\n", "', line 2: pixels '-9' is no count."),
         (HEADER + "0,s,c,9,0.1,0.2x\n", "', line 2: rmse '0.2x' is no number."),
         (HEADER + "0,s,c,9,0.1,0.2\n0,s,c,9,0.1,0.2\n", "', line 3: a second row of image '0'."),

@@ -121,3 +121,29 @@ def test_pairs_differ_in_the_first_key(make_run: MakeRun) -> None:
     c = read_run(make_run("c", config={"data.split": "random", "seed": 1}))
     assert pairs([a, b, c], "data.split", "data.split_seed") == [(a, b)]
     assert pairs([a, b, c], "data.split") == []
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"checkpoint": {"trained_on": "x"}},
+        {"checkpoint": {"trained_on": {"split": [1]}}},
+        {"checkpoint": {"trained_on": {"split": {"counts": 3}}}},
+        {"intervals": {"model": "x"}},
+        {"intervals": {"model": None}},
+    ],
+)
+def test_parts_of_another_shape_count_as_missing(make_run: MakeRun, damage: dict[str, object]) -> None:
+    path = make_run("one", tests={"eigen": {"abs_rel": 0.2}})
+    file = path / "test" / "eigen" / "metrics.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "split": {}, **damage}))
+    run = read_run(path)
+    assert run.training_images is run.interval("eigen", "abs_rel") is None
+    assert run.metric("eigen", "abs_rel") == 0.2
+
+
+def test_brackets_without_end_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "metrics.json"
+    file.write_text("[" * 100_000)
+    with pytest.raises(ConfigError, match=r"cannot be read \(RecursionError\)\. Run hudepth-test on that run again\."):
+        read_result(file)

@@ -55,7 +55,8 @@ def test_a_list_of_names_will_do(command: Command, tmp_path: Path) -> None:
     write_list(tmp_path / "nyu")
     done = command(*ARGUMENTS)
     assert done.code == 0, done.err
-    assert "images left out: no file '" in done.err
+    first = Path("nyu/nyu2_train/room_0000_out/1.jpg")
+    assert f"images left out: 96 of 97 files are missing, the first '{first}'. Records tell" in done.err
     assert not (tmp_path / "cache").exists()
     for text in ("48 pairs", "33 / 4 / 11", "random *", "not looked at", "warning", "split=random"):
         assert text in done.out
@@ -126,6 +127,52 @@ def test_large_sets_are_read_only_once_prepared(
     assert command("data", "prepare", *ARGUMENTS[2:]).code == 0
     assert "images left out" not in command(*ARGUMENTS).err
     assert report(tmp_path / "audit_densedepth")["images"]
+
+
+def test_bad_files_are_findings_and_the_rest_is_looked_at(command: Command, tmp_path: Path) -> None:
+    write_list(tmp_path / "nyu")
+    write_frames(tmp_path / "nyu", copies=False)
+    place = tmp_path / "nyu" / "nyu2_train" / "room_0002_out"
+    (place / "2.jpg").unlink()
+    (place / "3.png").write_bytes((place / "3.png").read_bytes()[:500])
+    cv2.imwrite(str(place / "4.png"), np.zeros((48, 64), np.uint8))
+    cv2.imwrite(str(place / "5.png"), np.full((24, 32), 100, np.uint8))
+    done = command(*ARGUMENTS)
+    assert done.code == 0, done.err
+    found = report(tmp_path / "audit_densedepth")
+    assert (found["pairs"], found["images"]) == (44, True)
+    (finding,) = (finding for finding in found["findings"] if finding["about"] == "unreadable pairs")
+    assert finding["severity"] == "warning"
+    lines = finding["values"]["skipped"]
+    assert len(lines) == 4
+    for line, text in zip(lines, ("no file", "3.png", "zero everywhere", "5.png"), strict=True):
+        assert text in line
+
+
+def test_wrong_units_are_a_finding_beside_the_leakage(command: Command, tmp_path: Path) -> None:
+    write_list(tmp_path / "nyu")
+    write_frames(tmp_path / "nyu", copies=False)
+    wrong = (*ARGUMENTS, "data.encoding=uint16_mm")
+    done = command(*wrong)
+    assert done.code == 0, done.err
+    found = report(tmp_path / "audit_densedepth")
+    assert found["images"] is False
+    assert found["splits"]["random"]["scene_seen"] == 1
+    assert found["findings"][1]["found"] == "cannot be prepared"
+    assert "Use data.encoding=uint8_10m" in found["findings"][1]["meaning"]
+    asked = command(*wrong, "images=true")
+    assert asked.code == 1
+    assert "Use data.encoding=uint8_10m" in asked.err.splitlines()[-1]
+
+
+def test_an_output_that_cannot_be_written(command: Command, tmp_path: Path) -> None:
+    write_list(tmp_path / "nyu")
+    (tmp_path / "taken").write_text("a file", encoding="utf-8")
+    done = command(*ARGUMENTS, "output=taken/below")
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        "hudepth-data: output: cannot write 'taken/below' (Not a directory). Pass output=<a folder>."
+    )
 
 
 def test_rooms_are_audited_without_files(command: Command, tmp_path: Path) -> None:

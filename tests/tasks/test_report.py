@@ -100,6 +100,7 @@ def test_a_table_of_several_runs_says_in_what_they_differ(command: Command, trai
     [
         ("[]", "runs is not set. Pass runs=[<run directory>,<run directory>]."),
         ("[nowhere]", "no folder 'nowhere'. Pass a run directory or a folder of test results."),
+        ("nowhere", "no folder 'nowhere'. Pass a run directory or a folder of test results."),
     ],
 )
 def test_mistakes_of_table(runs: str, message: str, command: Command) -> None:
@@ -127,3 +128,17 @@ def test_compare_takes_one_protocol(command: Command, trained: Path) -> None:
     done = command("report", "compare", f"a={trained}", f"b={trained}", "protocol=[paper,eigen]")
     assert done.code == 1
     assert done.err.splitlines()[-1] == "hudepth-report: protocol: compare takes one, not 2. Pass protocol=eigen."
+
+
+def test_compare_draws_no_images_of_other_data(command: Command, trained: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        shutil.copytree(trained, tmp_path / "runs" / name / trained.name)
+        file = tmp_path / "runs" / name / trained.name / "test" / "paper" / "metrics.json"
+        document = json.loads(file.read_text())
+        document["data"]["fingerprint"] = "0" * 64  # other rooms, whose images have the same names
+        file.write_text(json.dumps(document))
+    a, b = (tmp_path / "runs" / name / trained.name for name in ("one", "two"))
+    done = command("report", "compare", f"a={a}", f"b={b}", "protocol=paper")
+    assert done.code == 0, done.err
+    assert "no images.png: tested on other data" in done.err
+    assert {path.name for path in (tmp_path / "compare").iterdir()} == {"compare.json", "compare.csv", "compare.png"}

@@ -171,3 +171,16 @@ def test_an_output_in_the_way_is_found_before_the_work(command: Command, trained
     done = command("test", f"checkpoint={trained}", "output=taken")
     assert done.code == 1
     assert done.err.splitlines()[-1].startswith("hudepth-test: output: cannot make 'taken' (File exists).")
+
+
+def test_a_protocol_that_scores_nothing_does_not_lose_the_others(
+    command: Command, trained: Path, tmp_path: Path
+) -> None:
+    done = command(
+        "test", f"checkpoint={trained}", "protocol=[eigen,paper]", f"output={tmp_path / 'out'}", "panels=1",
+        "protocol.eigen.crop=[0,9000,0,9000]", "protocol.eigen.crop_size=null",
+    )  # fmt: skip
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith("hudepth-test: protocol=eigen: no pixel of ")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["paper"]
+    assert {"metrics.json", "per_image.csv", "panels.png"} <= {p.name for p in (tmp_path / "out" / "paper").iterdir()}

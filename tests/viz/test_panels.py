@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from hudepth.viz import panels as module
-from hudepth.viz.panels import DEPTH_COLOURS, ERROR_COLOURS, Panel, draw_panels, save_panels
+from hudepth.viz.panels import DEPTH_COLOURS, ERROR_COLOURS, Panel, draw_panels, save_figure, save_panels
 
 GREY = np.full(3, 191)  # of unmeasured pixels: 0.75 of 255
 F32 = NDArray[np.float32]
@@ -228,3 +229,16 @@ def test_real_frames(nyu_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     low, high = picture.figure.axes[-2].get_xlim()
     assert 0.4 < low < 2
     assert 3 < high < 11
+
+
+@pytest.mark.parametrize("title", ["$a_{b$", "$\\\\nonsense$", "$x$"])
+def test_dollar_signs_in_a_name_are_no_formula(tmp_path: Path, title: str) -> None:
+    figure = Figure()
+    figure.suptitle(title)
+    axis = figure.subplots()
+    axis.set_yticks([0.5], [title])
+    axis.set_title(title, loc="left")
+    save_figure(tmp_path / "figure.png", figure)
+    assert {text.get_text() for text in figure.findobj(Text) if not text.get_parse_math()} >= {title}
+    assert not [text for text in figure.findobj(Text) if text.get_text() == title and text.get_parse_math()]
+    assert draw_panels([make_panel(title=title)]).size
