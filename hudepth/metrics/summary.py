@@ -33,8 +33,14 @@ DEPTH_NAMES = (
 """Defined for every image that has a pixel; others, like ssim, may be undefined (NaN) for some images."""
 SQUARED = ("rmse", "rmse_log")
 """Pooled as squares."""
+_HIGHER_IS_BETTER = ("delta", "ssim", "edge_f1", "edge_precision", "edge_recall", "si_boundary_f1")
 KEYS = ("id", "scene", "category", "pixels")
 """First columns of per_image.csv."""
+
+
+def higher_is_better(name: str) -> bool:
+    """Tell whether a metric is a share or a similarity; all others are errors."""
+    return name.startswith(_HIGHER_IS_BETTER)
 
 
 @dataclass(frozen=True)

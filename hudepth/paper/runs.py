@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from hudepth.errors import ConfigError, HudepthError
+from hudepth.results import MODEL
 from hudepth.run_dir import is_run, read_config
 from hudepth.viz.curves import read_history
 
-MODEL = "model"
 """What metrics.json calls the trained network, beside the baselines."""
 INCIDENTAL = (
     "name", "monitor", "mode", "test", "resume", "trust", "callbacks", "logger", "protocol", "paths", "hydra", "debug",

@@ -1,4 +1,4 @@
-"""What the tasks share: from Hydra's configuration to plain Python, and from that to objects."""
+"""What the tasks share: from a plain configuration to objects."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.sources.base import Source
 from hudepth.errors import ConfigError
@@ -18,21 +16,6 @@ from hudepth.metrics.protocol import Protocol
 
 SOURCE_KEYS = ("root", "encoding")
 """Keys of ``data`` that belong to the source: they stand above it because people type them."""
-
-
-def plain(cfg: DictConfig) -> dict[str, Any]:
-    """Resolve a Hydra configuration into dicts, lists and scalars: all that goes below the tasks.
-
-    Raises:
-        ConfigError: if a mandatory value is missing.
-    """
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        wanted = {"checkpoint": "file | run directory | last"}.get(missing[0], "value")
-        raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<{wanted}>.")
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
-    return {str(key): value for key, value in config.items()}
 
 
 @contextmanager

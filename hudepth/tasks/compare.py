@@ -18,15 +18,14 @@ from hudepth.console import log
 from hudepth.errors import ConfigError, DataError, HudepthError, did_you_mean
 from hudepth.files import write_json, write_text
 from hudepth.metrics.bootstrap import LEVEL, REPEATS, SEED, Difference, describe, paired_differences
-from hudepth.metrics.summary import ImageTable
+from hudepth.metrics.summary import ImageTable, higher_is_better
 from hudepth.results import Result, find_result, paired
 from hudepth.run_dir import CHECKPOINTS
+from hudepth.tasks.config import whole_number
 from hudepth.viz.compare import save_comparison
 from hudepth.viz.panels import save_panels
 
 UNITS = {"mae": "m", "rmse": "m", "sq_rel": "m", "mse": "m²"}
-HIGHER_IS_BETTER = ("delta", "ssim", "edge_f1", "edge_precision", "edge_recall", "si_boundary_f1")
-"""How the names of metrics begin that are shares or similarities; all others are errors."""
 PER_IMAGE = ("abs_rel", "rmse")
 """Metrics of compare.csv; its rows are in the order of the first."""
 SHOWN = 12
@@ -49,7 +48,10 @@ def compare(config: dict[str, Any]) -> None:
         if not config.get(key):
             raise ConfigError(f"{key} is not set. Pass {key}=<run directory | folder of test results>.")
     protocol = str(config.get("protocol") or "eigen")
-    repeats, seed = _count(config, "repeats", REPEATS, least=100), _count(config, "seed", SEED, least=0)
+    repeats, seed = (
+        whole_number(config, "repeats", default=REPEATS, least=100),
+        whole_number(config, "seed", default=SEED),
+    )
     a, b = (find_result(str(config[key]), protocol) for key in ("a", "b"))
     tables = paired(a, b)
     differences = paired_differences(*tables, **a.averaging, repeats=repeats, seed=seed)
@@ -70,7 +72,7 @@ def compare(config: dict[str, Any]) -> None:
 def _draw_images(path: Path, a: Result, b: Result, config: dict[str, Any]) -> None:
     """Draw what both networks see in the images that differ most, if checkpoints and data are at hand."""
     runs = {name: result.path.parent.parent for name, result in (("a", a), ("b", b))}
-    if not config.get("panels") or not all((run / CHECKPOINTS).is_dir() for run in runs.values()):
+    if not whole_number(config, "panels", default=0) or not all((run / CHECKPOINTS).is_dir() for run in runs.values()):
         return
     if not all(_of_training_data(result) for result in (a, b)):
         log.warning(
@@ -94,24 +96,13 @@ def _of_training_data(result: Result) -> bool:
     return bool(trained_on == result.data["fingerprint"])
 
 
-def _count(config: dict[str, Any], key: str, default: int, *, least: int) -> int:
-    value = config.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ConfigError(f"{key}: {value} is no whole number of at least {least}. Leave it out for {default}.")
-    return value
-
-
 def verdict(name: str, difference: Difference) -> str:
     """Say what an interval of b - a shows: ``a better``, ``b better``, ``no difference shown`` or ``undefined``."""
     if math.isnan(difference.low) or math.isnan(difference.high):
         return "undefined"
     if difference.low <= 0 <= difference.high:
         return "no difference shown"
-    return "b better" if (difference.low > 0) == _higher(name) else "a better"
-
-
-def _higher(name: str) -> bool:
-    return name.startswith(HIGHER_IS_BETTER)
+    return "b better" if (difference.low > 0) == higher_is_better(name) else "a better"
 
 
 def differing(a: Result, b: Result, count: int, *, metric: str = "abs_rel") -> list[str]:
@@ -228,7 +219,7 @@ def print_comparison(a: Result, b: Result, differences: dict[str, Difference], u
         places = 4 if not max(abs(before), abs(after)) >= 10 else 2
         word = verdict(name, difference)
         table.add_row(
-            escape(name + (f" [{UNITS[name]}]" if name in UNITS else "")) + (" ↑" if _higher(name) else " ↓"),
+            escape(name + (f" [{UNITS[name]}]" if name in UNITS else "")) + (" ↑" if higher_is_better(name) else " ↓"),
             f"{before:.{places}f}",
             f"{after:.{places}f}",
             f"{difference.value:+.{places}f}",

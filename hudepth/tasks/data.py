@@ -12,7 +12,8 @@ from hudepth.data.prepare import store_path
 from hudepth.data.splits import SUBSETS, make_split
 from hudepth.errors import ConfigError, DataError
 from hudepth.tasks.audit import audit
-from hudepth.tasks.common import build_data, plain
+from hudepth.tasks.common import build_data
+from hudepth.tasks.config import plain
 
 
 def data(cfg: DictConfig) -> None:

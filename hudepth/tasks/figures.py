@@ -9,6 +9,7 @@ from hudepth.callbacks import evenly_spaced
 from hudepth.console import log
 from hudepth.errors import ConfigError, HudepthError
 from hudepth.run_dir import is_run, newest_run
+from hudepth.tasks.config import whole_number
 from hudepth.tasks.pictures import run_panels
 from hudepth.viz.curves import read_history, save_curves
 from hudepth.viz.panels import save_panels
@@ -28,17 +29,18 @@ def figures(config: dict[str, Any]) -> None:
     run = newest_run(config["paths"]["runs"]) if config["run"] == "last" else Path(str(config["run"])).expanduser()
     if not is_run(run):
         raise ConfigError(f"run: '{run}' is no run directory. Pass run=<runs/name/date_time>, or run=last.")
-    output = Path(config["output"]) if config["output"] else run / "figures"
-    save_curves(
-        output / "curves.png", read_history(run / "metrics.csv"), title=f"{run.parent.name}: loss and raw terms"
-    )
+    output = Path(config["output"]).expanduser() if config["output"] else run / "figures"
+    count = whole_number(config, "panels", default=6)
+    history = read_history(run / "metrics.csv")
+    try:
+        save_curves(output / "curves.png", history, title=f"{run.parent.name}: loss and raw terms")
+    except OSError as error:
+        raise ConfigError(f"output: cannot write '{output}' ({error.strerror}). Pass output=<a folder>.") from error
     log.info("total loss and each term, by epoch: %s", (output / "curves.png").resolve())
-    if not config["panels"]:
+    if not count:
         return
     try:
-        panels = run_panels(
-            run, lambda datamodule: evenly_spaced(sorted(datamodule.split.test), config["panels"]), config=config
-        )
+        panels = run_panels(run, lambda datamodule: evenly_spaced(sorted(datamodule.split.test), count), config=config)
     except HudepthError as error:
         log.warning("no panels: %s", error)
         return

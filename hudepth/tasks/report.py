@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 from hudepth.cli import VERBS
 from hudepth.errors import ConfigError, did_you_mean
-from hudepth.tasks.common import plain
+from hudepth.tasks.config import plain
 
 
 def report(cfg: DictConfig) -> None:

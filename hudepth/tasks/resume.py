@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from hudepth import run_dir
 from hudepth.checkpoint import read_plain
 from hudepth.errors import CheckpointError, ConfigError
-from hudepth.tasks.common import plain
+from hudepth.tasks.config import plain
 
 CHANGEABLE = (
     "trainer.", "callbacks.", "logger.", "data.root", "data.num_workers", "data.prepare_workers", "paths.",

@@ -24,12 +24,12 @@ from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.scoring import image_table
 from hudepth.metrics.strata import strata_csv, summarise_strata
 from hudepth.metrics.summary import ImageTable, per_image_csv, summarise
+from hudepth.results import MODEL
 from hudepth.tasks.common import build_protocols, without_known_warnings
+from hudepth.tasks.config import whole_number
 from hudepth.tasks.tables import print_results
 from hudepth.viz.panels import save_panels
 from hudepth.viz.strata import save_strata
-
-MODEL = "model"
 
 
 def score_checkpoint(
@@ -50,6 +50,7 @@ def score_checkpoint(
     Raises:
         HudepthError: with one line for the user.
     """
+    count = whole_number(config, "panels", default=6)
     protocols = build_protocols(config["protocol"], datamodule=datamodule, trust=config["trust"])
     try:
         output.mkdir(parents=True, exist_ok=True)  # not after the work is done
@@ -71,7 +72,7 @@ def score_checkpoint(
             results[protocol.name] = _write_results(output / protocol.name, protocol, evaluation, datamodule, shared)
         except ConfigError as error:  # what the other protocols say is not lost
             failed.append(error)
-    if count := config.get("panels", 6):
+    if count:
         shown = evenly_spaced(evaluation.indices, count)
         panels = make_panels(predictors[MODEL], datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
         for name in results:
@@ -118,7 +119,8 @@ def _write_results(
         rows = summarise_strata(evaluation.strata[protocol.name], model.categories)
         write_text(folder / "strata.csv", strata_csv(rows))
         save_strata(folder / "strata.png", rows, title=title)
-    print_results(metrics, ranges[MODEL], scenes=describe(model)["scenes"], title=title)
+    over = f"{describe(model)['scenes']} {'scenes' if any(model.scenes) else 'images, whose scenes are unknown'}"
+    print_results(metrics, ranges[MODEL], over=over, title=title)
     return metrics
 
 

@@ -18,10 +18,10 @@ from hudepth.files import write_text
 from hudepth.metrics.bootstrap import intervals
 from hudepth.results import Result, find_result, merge
 from hudepth.run_dir import CHECKPOINTS
+from hudepth.tasks.tables import NARROW as METRICS
 
-METRICS = ("abs_rel", "rmse", "log10", "ssim", "delta1", "delta2", "delta3")
-NARROW = ("abs_rel", "rmse", "ssim", "delta1")
-"""Columns in a terminal too narrow for all."""
+FEW = ("abs_rel", "rmse", "ssim", "delta1")
+"""Columns in a terminal too narrow for all; the files always have all."""
 
 
 def table(config: dict[str, Any]) -> None:
@@ -85,7 +85,7 @@ def _markdown(rows: Rows, ranges: Ranges, marks: Sequence[str]) -> str:
     lines = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
     for row in rows:
         cells = [row["name"], *(row[key] for key in marks), *(" ".join(_cell(row, ranges, m)) for m in METRICS)]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
+        lines.append(f"| {' | '.join(str(cell).replace('|', '&#124;') for cell in cells)} |")
     return "\n".join([*lines, "", "In brackets: 95 % intervals by scene; rmse in metres.", ""])
 
 
@@ -102,7 +102,7 @@ def _print(rows: Rows, ranges: Ranges, marks: Sequence[str]) -> None:
     shown = Table(caption="rmse in metres; delta and ssim: higher is better; in brackets: 95 % by scene")
     for name in ("", *marks):
         shown.add_column(name, overflow="fold", min_width=10 if name else 20)
-    metrics = METRICS if out.width >= 190 else NARROW
+    metrics = METRICS if out.width >= 190 else FEW
     for metric in metrics:
         shown.add_column(metric, justify="right", no_wrap=True)
     for row in rows:

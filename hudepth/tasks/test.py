@@ -13,7 +13,8 @@ from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import Split, load_split, make_split
 from hudepth.errors import CheckpointError, ConfigError, DataError, did_you_mean
-from hudepth.tasks.common import build_data, plain
+from hudepth.tasks.common import build_data
+from hudepth.tasks.config import plain
 from hudepth.tasks.score import score_checkpoint
 
 

@@ -39,7 +39,8 @@ from hudepth.errors import ConfigError, HudepthError
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
 from hudepth.tasks.checks import check_config, check_input, check_monitor
-from hudepth.tasks.common import build_data, build_protocols, plain, without_known_warnings
+from hudepth.tasks.common import build_data, build_protocols, without_known_warnings
+from hudepth.tasks.config import plain
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.score import score_checkpoint
 
