@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.findings import Finding, depth_findings, sample_raw, scan_store, split_finding
-from hudepth.data.hashes import NEAR_BITS, Duplicates, find_duplicates, nearest_hashes
-from hudepth.data.leakage import UNKNOWN, WITHIN, Leakage, SceneOrder, leakage
+from hudepth.data.hashes import NEAR_BITS, find_duplicates
+from hudepth.data.leakage import leakage
+from hudepth.data.leaks import Audited, worst_leaks
 from hudepth.data.prepare import store_path
 from hudepth.data.sources.base import Record
-from hudepth.data.splits import Split, make_split
+from hudepth.data.splits import make_split
 from hudepth.data.store import DepthStore
 from hudepth.errors import ConfigError, DataError
 from hudepth.files import write_json
+from hudepth.tasks.audit_tables import print_audit
 from hudepth.viz.leaks import Leak, save_leaks
 
 KINDS = ("random", "scene", "official")
 SMALL = 5000
 """Sets of at most so many pairs are prepared for ``images=auto``: it takes minutes."""
-ROWS = 6
-"""Leaks shown in the picture."""
 TITLES = {
     "near": "test images with a near duplicate in training",
     "scene": "test images whose scene is in training",
@@ -42,17 +35,6 @@ LEGEND = (
     f"Hash: 64 bits an image. Near duplicates (red) differ in at most {NEAR_BITS}, unrelated images in about 32.\n"
     "Orange: the most similar training image of the same scene. Grey: of other scenes."
 )
-COLOURS = {"ok": "green", "note": "yellow", "warning": "red"}
-
-
-@dataclass(frozen=True)
-class Audited:
-    """A kind of split and what it leaks."""
-
-    split: Split
-    leak: Leakage
-    copies: Duplicates | None
-    """None if the images were not looked at."""
 
 
 def audit(config: dict[str, Any], datamodule: DepthDataModule) -> None:
@@ -88,7 +70,7 @@ def audit(config: dict[str, Any], datamodule: DepthDataModule) -> None:
         findings += depth_findings(store, scan, raw, indoor=source.indoor, max_depth_m=datamodule.max_depth_m)
         if isinstance(chosen, Audited):
             leaks = worst_leaks(records, chosen, scan.hashes)
-    _print(source.name, len(records), kinds, datamodule.split_kind, findings)
+    print_audit(source.name, len(records), kinds, datamodule.split_kind, findings)
     report = _report(datamodule, records, kinds, findings, leaks, images=store is not None)
     try:
         write_json(output / "audit.json", report)
@@ -150,58 +132,6 @@ def _look_at_images(wanted: object, datamodule: DepthDataModule, records: Sequen
     return False
 
 
-def worst_leaks(
-    records: Sequence[Record], audited: Audited, hashes: NDArray[np.uint64], *, rows: int = ROWS
-) -> list[dict[str, Any]]:
-    """Choose test images that training knows best, each with the training image that gives it away.
-
-    That is the near duplicate, where there is one; else the most similar training image of the same scene; else the
-    most similar of all. They come in this order, then by hash, then by distance; a scene comes a second time only
-    after all others have come once.
-
-    Args:
-        records: of the store.
-        audited: a split, with its duplicates.
-        hashes: [n] of all images of the store.
-        rows: how many to choose.
-    """
-    order, copies = SceneOrder(records), audited.copies
-    assert copies is not None
-    train = np.asarray(audited.split.train, np.int64)
-    train_scene = order.scene[train]
-    found: list[dict[str, Any]] = []
-    for row, test in enumerate(audited.split.test):
-        nearest, bits = int(copies.nearest[row]), int(copies.bits[row])
-        roommates = train[(train_scene == order.scene[test]) & (train_scene != UNKNOWN)]
-        if bits > NEAR_BITS and len(roommates):
-            position, differing = nearest_hashes(hashes[[test]], hashes[roommates])
-            nearest, bits = int(roommates[position[0]]), int(differing[0])
-        frames = order.distance(test, nearest)
-        found.append(
-            {
-                "test": test,
-                "train": nearest,
-                "equal": bool(copies.equal[row]),
-                "near": bits <= NEAR_BITS,
-                "bits": bits,
-                "frames_apart": None if frames == UNKNOWN else frames,
-            }
-        )
-    found.sort(key=_harmlessness)
-    times: Counter[str] = Counter()
-    turns: list[int] = []
-    for leak in found:
-        scene = records[leak["test"]].scene or records[leak["test"]].id
-        turns.append(times[scene])
-        times[scene] += 1
-    return [found[i] for i in np.argsort(turns, kind="stable")[:rows]]
-
-
-def _harmlessness(leak: Mapping[str, Any]) -> tuple[int, ...]:
-    frames = leak["frames_apart"]
-    return not leak["equal"], not leak["near"], frames is None, leak["bits"], frames or 0
-
-
 def _chosen_finding(kind: str, chosen: Audited | str) -> Finding:
     if isinstance(chosen, Audited):
         return split_finding(kind, chosen.leak, chosen.copies)
@@ -231,51 +161,6 @@ def _verdict(leak: Mapping[str, Any], one: Record, other: Record) -> str:
         where = "different scenes" if one.scene and other.scene else "scene unknown"
     how = "equal pixels" if leak["equal"] else f"{leak['bits']} of 64 hash bits differ"
     return f"{how}\n{where}"
-
-
-def _print(name: str, n: int, kinds: Mapping[str, Audited | str], configured: str, findings: Sequence[Finding]) -> None:
-    console = Console(width=None if Console().is_terminal else 130)
-    table = Table(title=f"{name}, {n:,} pairs: what a test split shares with training", title_justify="left")
-    table.add_column("")
-    for kind in kinds:
-        table.add_column(f"{kind} *" if kind == configured else kind, justify="right")
-    cells = {kind: _cells(found) if isinstance(found, Audited) else {} for kind, found in kinds.items()}
-    labels = next((list(found) for found in cells.values() if found), [])
-    for label in labels:
-        table.add_row(Text(label), *(found.get(label, "-") for found in cells.values()))
-    if labels:
-        console.print(table)
-    print(
-        "* the configured split. Frames away: places between two frames of a scene, in order of their numbers.\n"
-        f"Near copies: images whose perceptual hashes differ in at most {NEAR_BITS} of 64 bits."
-    )
-    for kind, found in kinds.items():
-        if isinstance(found, str):
-            print(f"{kind} is not possible: {found.removeprefix(f'data.split={kind}: ')}")
-    listing = Table(title="\nfindings", title_justify="left")
-    for heading in ("", "about", "found", "what it means"):
-        listing.add_column(heading)
-    for finding in sorted(findings, key=lambda finding: list(COLOURS).index(finding.severity), reverse=True):
-        severity = Text(finding.severity, COLOURS[finding.severity])
-        listing.add_row(severity, Text(finding.about), Text(finding.found), Text(finding.meaning))
-    console.print(listing)
-
-
-def _cells(audited: Audited) -> dict[str, str]:
-    leak, copies, mean = audited.leak, audited.copies, audited.leak.mean_distance_frames
-    return {
-        "pairs in train / val / test": " / ".join(f"{count:,}" for count in leak.counts.values()),
-        "test frames of unknown scene": f"{leak.without_scene:,}",
-        "test frames whose scene is in training": _share(leak.scene_seen),
-        **{f"  with a training frame at most {k} frame{'s' * (k > 1)} away": _share(leak.within[k]) for k in WITHIN},
-        "  mean distance to the nearest [frames]": "-" if math.isnan(mean) else f"{mean:.2f}",
-        "test images with an exact copy in training": _share(copies.exact) if copies else "not looked at",
-        "test images with a near copy in training": _share(copies.near) if copies else "not looked at",
-    }
-
-
-def _share(share: float) -> str:
-    return "-" if math.isnan(share) else f"{share:.1%}"
 
 
 def _report(

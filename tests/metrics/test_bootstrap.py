@@ -133,11 +133,11 @@ def test_a_metric_that_one_scene_defines_has_no_interval() -> None:
 
 
 def test_draws_without_an_image_that_defines_a_metric_are_left_out() -> None:
-    table = make_table(scenes=4, holes=False)
-    two = np.isin(table.scenes, ["room_0", "room_1"])
-    table.values["ssim"][~two] = math.nan
-    drawn = bootstrap(table, averaging="image")["ssim"]
-    assert 0 < np.isnan(drawn).sum() < len(drawn)  # (2/4)^4 of them
+    table = make_table(scenes=10, holes=False)
+    five = np.isin(table.scenes, [f"room_{i}" for i in range(5)])
+    table.values["ssim"][~five] = math.nan
+    drawn = bootstrap(table, averaging="image", repeats=20_000)["ssim"]
+    assert 0 < np.isnan(drawn).sum() < len(drawn)  # (5/10)^10 of them
     low, high = intervals(table, averaging="image")["ssim"]
     assert low < summarise(table, averaging="image")["ssim"] < high
 
@@ -275,3 +275,10 @@ def test_few_scenes_need_the_wider_percentiles() -> None:
     share = coverage(8, sets=250, repeats=1000)
     assert 0.90 <= share["expanded"] <= 0.98
     assert share["plain"] < share["expanded"] - 0.03
+
+
+@pytest.mark.parametrize(("scenes", "known"), [(1, False), (4, False), (5, True)])
+def test_a_few_scenes_give_no_interval(scenes: int, known: bool) -> None:
+    table = make_table(scenes=scenes, holes=False)
+    low, high = intervals(table, averaging="image")["rmse"]
+    assert math.isfinite(low) == math.isfinite(high) == known

@@ -12,9 +12,9 @@ import pytest
 
 from hudepth.data.hashes import find_duplicates
 from hudepth.data.leakage import leakage
+from hudepth.data.leaks import Audited, worst_leaks
 from hudepth.data.sources.base import Record
 from hudepth.data.splits import Split
-from hudepth.tasks.audit import Audited, worst_leaks
 
 from .conftest import TINY, Command
 
