@@ -110,6 +110,14 @@ def test_the_results_are_those_of_the_run() -> None:
         assert shown == [f"{values[key]:.3f}" for key in ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")]
 
 
+def test_what_a_random_split_is_worth_is_what_the_study_found() -> None:
+    rows = json.loads((ROOT / "experiments" / "split_leakage" / "rooms.json").read_text())["rows"]
+    (same,) = [row["abs_rel"] for row in rows if row["what"] == "the same images"]
+    said = re.search(r"abs_rel ([\d.]+) after a random split and ([\d.]+) after a split by scene", README)
+    assert said
+    assert said.groups() == tuple(f"{same[side][0]:.3f}" for side in ("random", "disjoint"))
+
+
 @pytest.mark.parametrize("group", ["data", "protocol"])
 def test_a_table_lists_every_choice(group: str) -> None:
     (table,) = re.findall(rf"^\| `{group}=` \|.*\n\|---\|---\|\n((?:\|.*\n)+)", README, re.MULTILINE)

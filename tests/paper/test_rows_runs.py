@@ -28,10 +28,20 @@ def test_the_best_of_each_split_and_protocol_counts(make_run: MakeRun) -> None:
     row = accuracy_row(runs)
     assert row.verdict == "not reached"
     assert [(b["split"], b["abs_rel"]) for b in row.values["best"]] == [("official", 0.22), ("random", 0.1)]
-    assert (
-        "0.220 and 0.620 (nyu_labeled, official split, 654 images, protocol eigen; trained 1 epochs on 698"
-        in row.measured
+    assert "0.220 and 0.620 (official split of nyu_labeled, protocol eigen); 0.100 and 0.900 (random" in row.measured
+    assert [cells[2] for cells in row.sheets[0].cells] == ["0.220", "0.100"]
+
+
+def test_accuracy_names_one_protocol_of_each_split_and_no_other_set(make_run: MakeRun) -> None:
+    tests = {"paper": {"abs_rel": 0.2, "delta1": 0.7}, "eigen": {"abs_rel": 0.3, "delta1": 0.6}}
+    row = accuracy_row(
+        [
+            read_run(make_run("a", tests=tests)),
+            read_run(make_run("b", tests={"eigen": {"abs_rel": 0.01}}, source="rooms")),
+        ]
     )
+    assert row.measured == "Best ARE and delta1 on NYU: 0.300 and 0.600 (official split of nyu_labeled, protocol eigen)"
+    assert len(row.sheets[0].cells) == 3
 
 
 @pytest.mark.parametrize(
@@ -70,7 +80,7 @@ def test_random_against_official(
     for runs in ([random, official], [official, random]):
         row = split_effect_row(runs)
         assert row.verdict == verdict
-        assert row.measured == f"ARE 0.100 random, 0.200 official (protocol eigen): {said}"
+        assert row.measured == f"On nyu_labeled ARE 0.100 random, 0.200 official (protocol eigen): {said}"
         assert [cells[0] for cells in row.sheets[0].cells] == ["badcl (random)", "badcl (official)"]
 
 
@@ -138,4 +148,5 @@ def test_edges_under_badcl_and_another_loss(
     assert edges_row(runs[::-1]).verdict == verdict
     single = edges_row(runs[:1])
     assert single.verdict == "measured"
-    assert single.measured == f"badcl (BADCL, edges): edge_f1_0.25 {sum(ends[0]) / 2:.3f}"
+    assert single.measured == "Edges of 1 runs were measured, but no two runs differ in the loss alone"
+    assert single.sheets[0].cells[0][:4] == ["badcl", "BADCL", "edges", f"{sum(ends[0]) / 2:.3f}"]

@@ -40,6 +40,7 @@ def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
         "config.yaml", "overrides.txt", "environment.json", "split.json", "status.json", "train.log", "metrics.csv",
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "images/epoch_001.png", "images/epoch_002.png",
         *(f"test/{p}/{name}" for p in ("paper", "eigen") for name in ("metrics.json", "per_image.csv", "panels.png")),
+        "test/eigen/strata.csv", "test/eigen/strata.png",
     }  # fmt: skip
     assert expected <= files
     assert {name.split("/")[0] for name in files - expected} == {"tensorboard"}
