@@ -27,7 +27,7 @@ def markdown(rows: Sequence[Row], *, table_2: Sheet, runs: Sequence[Run], enviro
         runs: what was given as evidence.
         environment: versions, device and the command.
     """
-    command = " ".join(map(str, environment.get("command", ["hudepth-report", "paper"])))
+    command = " ".join(map(str, environment.get("command", ["hudepth-report", "paper"]))).replace(" verb=", " ")
     parts = [
         f"# What the paper claims, and what is measured\n\nThe paper: {CITATION}. Every figure under *measured* was "
         f"computed by `{command}` when it ran, or read from the runs listed at the end; only what stands under *the "
