@@ -115,6 +115,8 @@ def _write_results(
     )  # fmt: skip
     write_text(folder / "per_image.csv", per_image_csv(model))
     title = f"{protocol.name} protocol, {len(records) - len(left_out)} test images of {datamodule.source.name}"
+    if protocol.alignment != "none":
+        title += f", each prediction aligned to its truth ({protocol.alignment})"
     if protocol.strata:
         rows = summarise_strata(evaluation.strata[protocol.name], model.categories)
         write_text(folder / "strata.csv", strata_csv(rows))

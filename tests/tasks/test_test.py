@@ -184,3 +184,22 @@ def test_a_protocol_that_scores_nothing_does_not_lose_the_others(
     assert done.err.splitlines()[-1].startswith("hudepth-test: protocol=eigen: no pixel of ")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["paper"]
     assert {"metrics.json", "per_image.csv", "panels.png"} <= {p.name for p in (tmp_path / "out" / "paper").iterdir()}
+
+
+def test_a_protocol_of_your_own_is_named_and_stated(command: Command, trained: Path, tmp_path: Path) -> None:
+    own = (
+        "protocol=eigen",
+        "protocol.eigen.alignment=median",
+        "protocol.eigen.name=mine",
+        "protocol.eigen.strata=false",
+    )
+    done = command("test", f"checkpoint={trained}", *own, "output=out", "panels=0", "baselines=false")
+    assert done.code == 0, done.err
+    assert "mine protocol, " in done.out
+    assert "each prediction aligned to its truth (median)" in done.out
+    assert sorted(path.name for path in (tmp_path / "out" / "mine").iterdir()) == ["metrics.json", "per_image.csv"]
+    document = json.loads((tmp_path / "out" / "mine" / "metrics.json").read_text())
+    assert document["protocol"]["alignment"] == "median"
+    assert list(document["metrics"]) == list(document["intervals"]) == ["model"]
+    assert document["left_out"] == []
+    assert document["uncertainty"]["scenes"] == 1
