@@ -60,15 +60,21 @@ class DenseDepthSource(Source):
         self.subset = subset
         self.encoding = encoding
         self._handle = PerProcess(_open)
+        self._records: list[Record] | None = None
 
     def records(self) -> Sequence[Record]:
-        """List the pairs in order of the CSV files; the images need not be there.
+        """List the pairs in order of the CSV files, which are read once; the images need not be there.
 
         Raises:
             ConfigError: if an option is unknown.
             DataError: if a list is missing, empty or malformed.
         """
-        check_encoding(self.encoding)
+        if self._records is None:
+            check_encoding(self.encoding)
+            self._records = self._listed()
+        return self._records
+
+    def _listed(self) -> list[Record]:
         records: list[Record] = []
         lines: dict[str, str] = {}
         for split in self._splits():
