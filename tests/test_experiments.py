@@ -1,0 +1,69 @@
+"""What the studies' pages say is what their files hold."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from hudepth.results import find_result
+from hudepth.viz.curves import read_history
+
+STUDIES = Path(__file__).parents[1] / "experiments"
+
+
+@pytest.mark.parametrize(
+    ("label", "key", "best"),
+    [
+        ("validation abs_rel", "val/abs_rel", min),
+        (r"validation rmse \[m\]", "val/rmse", min),
+        ("validation delta1", "val/delta1", max),
+        ("validation loss", "val/total", min),
+        ("training loss", "train/total", min),
+    ],
+)
+def test_epochs(label: str, key: str, best: object) -> None:
+    history = read_history(STUDIES / "epochs" / "nyu_100_epochs" / "metrics.csv")
+    values = [row[key] for row in history]
+    assert len(values) == 100
+    row = re.search(rf"^\| {label} \|(.*)\|$", (STUDIES / "epochs" / "README.md").read_text(), re.MULTILINE)
+    assert row
+    said = [cell.strip() for cell in row[1].split("|")]
+    for text, part in zip(said, (values[:30], values), strict=False):
+        top = best(part)  # type: ignore[operator]
+        assert text == f"{top:.3f} (epoch {values.index(top) + 1})"
+    assert said[2:] == [f"{values[29]:.3f}", f"{values[99]:.3f}"]
+
+
+def test_split_leakage() -> None:
+    text = " ".join((STUDIES / "split_leakage" / "README.md").read_text().split())
+    rooms, nyu = (
+        json.loads((STUDIES / "split_leakage" / f"{name}.json").read_text())["rows"] for name in ("rooms", "nyu")
+    )
+    same, every = rooms[1]["abs_rel"], rooms[0]["abs_rel"]
+    assert f"abs_rel is {same['random'][0]:.3f} for" in text
+    assert f"and {same['disjoint'][0]:.3f} for the one that never saw the rooms" in text
+    assert f"better than the honest network's {every['disjoint'][0]:.3f}" in text
+    assert f"finds a gap of {nyu[1]['abs_rel']['gap'][0]:.3f} on the same images" in text
+    random = find_result(STUDIES / "split_leakage" / "rooms_video_random", "eigen")
+    nearest = random.document["metrics"]["nearest_frame"]["abs_rel"]
+    assert f"comes to {nearest:.3f} under the random split" in text
+
+
+def test_units() -> None:
+    text = " ".join((STUDIES / "units" / "README.md").read_text().split())
+    right, literal = (find_result(STUDIES / "units" / f"units_{name}", "paper") for name in ("right", "paper_literal"))
+    last = read_history(STUDIES / "units" / "units_paper_literal" / "metrics.csv")[-1]
+    assert f"has SSIM {literal.metrics['ssim']:.3f} and a validation loss of {last['val/total']:.4f}" in text
+    assert f"has SSIM {literal.document['metrics']['mean_depth']['ssim']:.3f}. Read rightly" in text
+    assert f"abs_rel {literal.metrics['abs_rel']:.3f} against {right.metrics['abs_rel']:.3f}" in text
+    assert f"rmse came to {literal.metrics['rmse']:.3f}" in text
+
+
+def test_every_result_of_a_study_can_be_read() -> None:
+    files = sorted(STUDIES.glob("**/test/*/metrics.json"))
+    assert len(files) > 15
+    for file in files:
+        assert find_result(file.parent, file.parent.name).metrics["abs_rel"] > 0
