@@ -170,18 +170,19 @@ def stamp_differences(a: Result, b: Result) -> list[str]:
 
 
 def _conditions(result: Result) -> dict[str, Any]:
-    conditions = _flat(result.stamp, "protocol.")
+    conditions = flat(result.stamp, "protocol.")
     if result.stamp.get("resolution") == "network":
         conditions |= {key: result.document.get(key) for key in ("network_size", "max_depth_m")}
     conditions |= {f"data.{key}": result.data.get(key) for key in ("source", "fingerprint", "encoding")}
     return conditions | {f"split.{key}": result.split.get(key) for key in ("kind", "sha256")}
 
 
-def _flat(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested values by dotted key, each key with ``prefix`` before it."""
+    found: dict[str, Any] = {}
     for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
 
 
 def _spelt(value: Any) -> str:

@@ -91,12 +91,12 @@ class Scored:
     def sums(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
         """Return a row of sums for each image, columns as in :data:`SUM_COLUMNS`.
 
-        An image that a crop in plain pixels does not fit into gets a count of 0.
+        An image that the crop exceeds, or of which it leaves nothing, counts 0 pixels.
         """
         height, width = self.grid.depth_m.shape[-2:]
         window = protocol.window(height, width)
         if window is None:
-            row = torch.zeros(len(self.pred_m), len(SUM_COLUMNS), dtype=torch.float64)
+            row = torch.zeros(len(self.pred_m), len(SUM_COLUMNS), dtype=torch.float64, device=self.pred_m.device)
             row[:, -1] = torch.nan
             return row
         rows, columns = window

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hudepth.errors import ConfigError, HudepthError
-from hudepth.results import MODEL
+from hudepth.results import MODEL, flat
 from hudepth.run_dir import is_run, read_config
 from hudepth.viz.curves import read_history
 
@@ -133,7 +133,7 @@ def read_run(path: Path) -> Run:
     config: dict[str, Any] = {}
     history: list[dict[str, float]] = []
     try:
-        config = dict(flat(read_config(path)))
+        config = flat(read_config(path))
     except HudepthError as error:
         problems.append(str(error))
     try:
@@ -169,15 +169,6 @@ def read_result(file: Path) -> dict[str, Any]:
         if not isinstance(result.get(key, {}), dict):
             raise ConfigError(f"'{file}': its '{key}' is no mapping. {again}")
     return dict(result)
-
-
-def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield a nested configuration's values by dotted key."""
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def same_but(a: Run, b: Run, *keys: str) -> bool:
