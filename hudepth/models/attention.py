@@ -2,30 +2,63 @@
 
 from __future__ import annotations
 
+import math
+
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.errors import ConfigError
 from hudepth.models.options import ACTIVATIONS, choose
 
+POSITIONS = ("none", "sine")
+"""Encodings of where a token stands, none of which has parameters: table A1 counts none."""
+
+
+def sine_positions(channels: int, height: int, width: int) -> Float[Tensor, "c h w"]:
+    """Return sines and cosines of row and column, each over half the channels (Carion et al. 2020, DETR).
+
+    Half of each half are sines, half cosines, of angles that fall geometrically from 1 to 1/10000 a pixel (Vaswani et
+    al. 2017).
+
+    Args:
+        channels: a multiple of 4.
+        height: rows.
+        width: columns.
+
+    Returns:
+        In float64, so that it is exact in whatever it is added to.
+    """
+    count = channels // 4
+    frequency = torch.exp(torch.arange(count, dtype=torch.float64) * (-math.log(10_000) / count))[:, None]
+    rows, columns = (frequency * torch.arange(length) for length in (height, width))  # [c/4, length]
+    rows = torch.cat([rows.sin(), rows.cos()])[:, :, None].expand(-1, -1, width)
+    columns = torch.cat([columns.sin(), columns.cos()])[:, None, :].expand(-1, height, -1)
+    return torch.cat([rows, columns])
+
 
 class TransformerBlock(nn.Module):
     """Post-norm self-attention: x = LN(x + MHA(x)); x = LN(x + FFN(x)).
 
-    The positions of the map are the tokens; no positional encoding, since table A1 counts no parameter for one.
+    The positions of the map are the tokens.
 
     Args:
         channels: width of a token.
         heads: attention heads; must divide ``channels``. The paper does not state it.
         expansion: width of the feed-forward layer over that of a token (table A1: 4).
         activation: of the feed-forward layer: relu, gelu or silu. The paper does not state it.
+        positions: what tells tokens where they stand: "none" (figure 4 shows nothing), or "sine", which is added to
+            queries and keys. ``channels`` must then be a multiple of 4.
 
     Raises:
-        ConfigError: if ``heads`` does not divide ``channels`` or the activation is unknown.
+        ConfigError: if ``heads`` does not divide ``channels``, or the activation or the encoding is unknown.
     """
 
-    def __init__(self, channels: int, *, heads: int = 8, expansion: int = 4, activation: str = "relu") -> None:
+    def __init__(
+        self, channels: int, *, heads: int = 8, expansion: int = 4, activation: str = "relu", positions: str = "none"
+    ) -> None:
         super().__init__()
+        self.positions = choose("model.attention_positions", positions, dict.fromkeys(POSITIONS, positions))
         if heads < 1 or channels % heads:
             usable = [n for n in (1, 2, 4, 8, 16, 32, 64) if channels % n == 0]
             raise ConfigError(
@@ -43,6 +76,10 @@ class TransformerBlock(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Let every position of the map look at every other."""
         tokens: Tensor = x.flatten(2).transpose(1, 2)
-        tokens = self.norm1(tokens + self.attention(tokens, tokens, tokens, need_weights=False)[0])
+        asked = tokens
+        if self.positions == "sine":  # not added to the values: they go on to the decoder
+            where = sine_positions(*x.shape[1:]).to(x)
+            asked = tokens + where.flatten(1).T
+        tokens = self.norm1(tokens + self.attention(asked, asked, tokens, need_weights=False)[0])
         tokens = self.norm2(tokens + self.feed_forward(tokens))
         return tokens.transpose(1, 2).reshape(x.shape)

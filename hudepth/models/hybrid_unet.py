@@ -28,6 +28,7 @@ class HybridUNet(nn.Module):
         attention: transformer blocks on ``none``, ``skip``, ``deepest`` or ``both`` (table A1).
         attention_heads: heads of each block (not stated in the paper).
         attention_activation: relu, gelu or silu inside each block (not stated).
+        attention_positions: ``none`` (figure 4 shows nothing) or ``sine``, added to each block's queries and keys.
         upsample: ``nearest`` (figure 4 says UpSampling2D, whose default it is) or ``bilinear``.
         output: ``sigmoid``, ``relu``, ``softplus`` or ``identity`` after the last convolution (not stated).
 
@@ -43,6 +44,7 @@ class HybridUNet(nn.Module):
         attention: str = "both",
         attention_heads: int = 8,
         attention_activation: str = "relu",
+        attention_positions: str = "none",
         upsample: UpsampleMode = "nearest",
         output: str = "sigmoid",
     ) -> None:
@@ -51,7 +53,9 @@ class HybridUNet(nn.Module):
         choose("model.upsample", upsample, {"nearest": 0, "bilinear": 0})
 
         def block(channels: int) -> nn.Module:
-            return TransformerBlock(channels, heads=attention_heads, activation=attention_activation)
+            return TransformerBlock(
+                channels, heads=attention_heads, activation=attention_activation, positions=attention_positions
+            )
 
         self.trunk = ResNet18Trunk(weights=weights)
         self.attention_skip = block(128) if on_skip else nn.Identity()

@@ -11,6 +11,8 @@ from torch import nn
 from hudepth.errors import ConfigError, did_you_mean
 from hudepth.module import DepthModule
 
+MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
+
 
 def check_config(config: dict[str, Any]) -> None:
     """Check what no constructor checks in time, before anything is written.
@@ -22,6 +24,12 @@ def check_config(config: dict[str, Any]) -> None:
         raise ConfigError(f"seed: {config['seed']!r} is not a whole number.")
     if config["mode"] not in ("min", "max"):
         raise ConfigError(f"mode: no '{config['mode']}'. Pass min or max: which way monitor is better.")
+    layout = config.get("memory_format", "contiguous")  # runs that were begun before there was a choice have none
+    if layout not in MEMORY_FORMATS:
+        raise ConfigError(
+            f"memory_format: no '{layout}'.{did_you_mean(str(layout), MEMORY_FORMATS)} "
+            "Pass contiguous or channels_last."
+        )
     name = config["name"]
     if name is None or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", str(name)) or ".." in str(name).split("/"):
         raise ConfigError(f"name: {name!r} cannot name a folder of runs. Use letters, digits, '.', '_' and '-'.")

@@ -38,7 +38,7 @@ from hudepth.data.splits import load_split, save_split
 from hudepth.errors import ConfigError, HudepthError
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
-from hudepth.tasks.checks import check_config, check_input, check_monitor
+from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, check_monitor
 from hudepth.tasks.common import build_data, build_protocols, without_known_warnings
 from hudepth.tasks.config import plain
 from hudepth.tasks.resume import resumed_config
@@ -146,6 +146,7 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     if config["test"]:  # a wrong protocol should not be found after hours
         build_protocols(config["protocol"], datamodule=datamodule, trust=trust)
     net = instantiate(config["model"], trust=trust, only=nn.Module)
+    net.to(memory_format=MEMORY_FORMATS[config.get("memory_format", "contiguous")])
     check_input(net, datamodule.size)
     split_file = path / "split.json"
     if resumed is not None and split_file.exists():
@@ -177,7 +178,7 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
         torch.distributed.destroy_process_group()  # one process tests: it should wait for no other
     if config["test"] and trainer.is_global_zero:
         checkpoint = load_checkpoint(str(path))
-        options = {key: config["trainer"][key] for key in ("accelerator", "precision")}  # one device: exact, and enough
+        options = {"accelerator": config["trainer"]["accelerator"]}  # one device and full precision, as hudepth-test
         score_checkpoint(checkpoint, config={**config, "trainer": options}, output=path / "test", datamodule=datamodule)
     return None if score is None else float(score)
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from hudepth.errors import ConfigError
-from hudepth.models.attention import TransformerBlock
+from hudepth.models.attention import TransformerBlock, sine_positions
 
 F64 = NDArray[np.float64]
 
@@ -31,13 +31,37 @@ ACTIVATIONS = {
 }
 
 
-def oracle(block: TransformerBlock, image: F64, *, heads: int, activation: str) -> F64:
+def positions_by_hand(c: int, h: int, w: int) -> F64:
+    """The encoding of each pixel, channel by channel: sines then cosines of its row, then of its column."""
+    result = np.zeros((c, h, w))
+    n = c // 4
+    for y in range(h):
+        for x in range(w):
+            for i in range(n):
+                angle = 10000.0 ** (-i / n)
+                result[i, y, x], result[n + i, y, x] = math.sin(y * angle), math.cos(y * angle)
+                result[2 * n + i, y, x], result[3 * n + i, y, x] = math.sin(x * angle), math.cos(x * angle)
+    return result
+
+
+def oracle(block: TransformerBlock, image: F64, *, heads: int, activation: str, positions: str = "none") -> F64:
     """Post-norm self-attention of one map [c, h, w], token by token and head by head, in numpy."""
     p = {name: value.detach().numpy() for name, value in block.named_parameters()}
     c, h, w = image.shape
     tokens = np.array([image[:, y, x] for y in range(h) for x in range(w)])
-    qkv = tokens @ p["attention.in_proj_weight"].T + p["attention.in_proj_bias"]
-    q, k, v = qkv[:, :c], qkv[:, c : 2 * c], qkv[:, 2 * c :]
+    asked = tokens
+    if positions == "sine":
+        where = positions_by_hand(c, h, w)
+        asked = tokens + np.array([where[:, y, x] for y in range(h) for x in range(w)])
+    q, k, v = (
+        x @ weight.T + bias
+        for x, weight, bias in zip(
+            (asked, asked, tokens),
+            np.split(p["attention.in_proj_weight"], 3),
+            np.split(p["attention.in_proj_bias"], 3),
+            strict=True,
+        )
+    )
     width = c // heads
     mixed = np.zeros_like(tokens)
     for head in range(heads):
@@ -58,16 +82,31 @@ def oracle(block: TransformerBlock, image: F64, *, heads: int, activation: str) 
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("activation", ["relu", "gelu", "silu"])
 @pytest.mark.parametrize("heads", [1, 4])
-def test_block_is_post_norm_attention(heads: int, activation: str, training: bool) -> None:
+@pytest.mark.parametrize("positions", ["none", "sine"])
+def test_block_is_post_norm_attention(positions: str, heads: int, activation: str, training: bool) -> None:
     torch.manual_seed(heads)
-    block = TransformerBlock(8, heads=heads, activation=activation).double().train(training)
+    block = TransformerBlock(8, heads=heads, activation=activation, positions=positions).double().train(training)
     for parameter in block.parameters():  # biases and norms start at 0 and 1, which would hide mistakes
         torch.nn.init.normal_(parameter, std=0.5)
     images = torch.randn(2, 8, 3, 5, dtype=torch.float64)
     with torch.no_grad():
         result = block(images)
-    expected = np.stack([oracle(block, image.numpy(), heads=heads, activation=activation) for image in images])
+    options = {"heads": heads, "activation": activation, "positions": positions}
+    expected = np.stack([oracle(block, image.numpy(), **options) for image in images])
     np.testing.assert_allclose(result.numpy(), expected, rtol=1e-10, atol=1e-10)
+
+
+def test_an_encoding_of_positions_has_no_parameters_and_tells_all_pixels_apart() -> None:
+    plain, encoded = (TransformerBlock(8, heads=2, positions=p).state_dict() for p in ("none", "sine"))
+    assert plain.keys() == encoded.keys()
+    tokens = sine_positions(8, 28, 28).flatten(1).T
+    distance = torch.cdist(tokens, tokens) + torch.eye(len(tokens))
+    assert distance.min() > 1e-3
+
+
+def test_unknown_encoding() -> None:
+    with pytest.raises(ConfigError, match=r"^model\.attention_positions: no 'sin'\. Did you mean 'sine'\? Pass one of"):
+        TransformerBlock(8, positions="sin")
 
 
 def test_positions_are_not_encoded() -> None:
