@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import os
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 
 from hudepth.console import log
 from hudepth.errors import CheckpointError, ConfigError
@@ -115,6 +117,62 @@ def write_status(path: Path, state: str, **more: Any) -> None:
     more = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in more.items()}
     now = datetime.now(UTC).isoformat(timespec="seconds")
     write_json(path / "status.json", {"state": state, "time": now, "pid": os.getpid(), **more})
+
+
+STATES = ("running", "finished", "failed", "interrupted", "pruned")
+LOCK = ".lock"
+
+
+@contextmanager
+def held(path: Path, *, timeout_s: float = 0) -> Iterator[None]:
+    """Keep every other process from working in a run directory while the block runs; a kill lets go of it.
+
+    Args:
+        path: the run directory.
+        timeout_s: how long to wait for a process that is already at it.
+
+    Raises:
+        ConfigError: if one still is.
+    """
+    lock = FileLock(path / LOCK)
+    try:
+        lock.acquire(timeout=timeout_s)
+    except Timeout:
+        by = _read_status(path).get("pid", "unknown")
+        raise ConfigError(
+            f"'{path}' is being worked on by another process (number {by}). Wait for it, or end it."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def state(path: Path) -> tuple[str, str]:
+    """Return how a run stands, and the line of the error if it failed.
+
+    Returns:
+        One of :data:`STATES`; a run that says it is running but is held by no process was killed: ``interrupted``.
+    """
+    status = _read_status(path)
+    found = str(status.get("state"))
+    if found not in STATES:
+        return "interrupted", ""
+    if found == "running":
+        try:
+            with held(path):
+                return "interrupted", ""
+        except (ConfigError, OSError):
+            return "running", ""
+    return found, str(status.get("error") or "")
+
+
+def _read_status(path: Path) -> dict[str, Any]:
+    try:
+        status = json.loads((path / "status.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return status if isinstance(status, dict) else {}
 
 
 @contextmanager
