@@ -17,6 +17,7 @@ An interval says how much a result depends on which scenes were tested, not on t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.errors import DataError
+from hudepth.metrics.student import student_quantile
 from hudepth.metrics.summary import Floats, ImageTable, additive, metrics_from_sums, summarise
 
 LEVEL = 0.95
@@ -47,13 +49,63 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class _Draws:
+class Draws:
     """Metrics of resampled sets."""
 
     metrics: dict[str, Floats]
     """[repeats] by name."""
     scenes: dict[str, int]
     """How many scenes define each metric."""
+
+
+class Resampler:
+    """Draws of scenes, made once for all tables of the same images.
+
+    Args:
+        table: one of them; an image whose scene is empty counts as a scene of its own.
+        repeats: how many sets to draw.
+        seed: of the draws.
+    """
+
+    def __init__(self, table: ImageTable, *, repeats: int = REPEATS, seed: int | Sequence[int] = SEED) -> None:
+        self._scene, self._counted = _scenes(table)
+        self._repeats, self._seed = repeats, seed
+        self._count = int(self._scene.max(initial=-1)) + 1
+        self._kept = list(self._drawn()) if repeats * self._count <= MOST_COUNTS else None
+
+    def _drawn(self) -> Iterator[Floats]:
+        """Yield how often each scene was drawn, [some repeats, scenes] at a time."""
+        if not self._count:
+            return
+        generator, share = np.random.default_rng(self._seed), np.full(self._count, 1 / self._count)
+        for part in np.array_split(np.arange(self._repeats), math.ceil(self._repeats * self._count / MOST_COUNTS)):
+            yield generator.multinomial(self._count, share, size=len(part)).astype(np.float64)
+
+    def draws(
+        self, table: ImageTable, *, averaging: str, silog_lambda: float = 1.0, silog_factor: float = 100.0
+    ) -> Draws:
+        """Return the metrics of the drawn sets.
+
+        Args:
+            table: of the same images, scenes and pixels in the same order as the resampler's.
+            averaging: as in :func:`hudepth.metrics.summary.summarise`, like the two that follow.
+            silog_lambda: see there.
+            silog_factor: see there.
+        """
+        columns = additive(table, averaging=averaging)
+        # [scenes, 2 metrics]: sums of each scene, so that a draw costs scenes and not images
+        flat = [row[self._counted] for column in columns.values() for row in column]
+        per_scene = np.stack([np.bincount(self._scene, weights=row, minlength=self._count) for row in flat], axis=1)
+        drawn = np.zeros((self._repeats, len(flat)))
+        start = 0
+        for counts in self._kept if self._kept is not None else self._drawn():
+            with np.errstate(invalid="ignore"):  # 0 times infinity
+                drawn[start : start + len(counts)] = counts @ per_scene
+            start += len(counts)
+        sums = dict(zip(columns, drawn.reshape(self._repeats, -1, 2).transpose(1, 2, 0), strict=True))
+        metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
+        defined = dict(zip(columns, np.count_nonzero(per_scene[:, 1::2], axis=0).tolist(), strict=True))
+        return Draws(metrics, {name: defined[name] for name in metrics})
 
 
 def bootstrap(
@@ -78,7 +130,8 @@ def bootstrap(
     Returns:
         [repeats] by metric. NaN where a prediction was NaN, and in draws without an image that defines the metric.
     """
-    return _draw(table, averaging, silog_lambda, silog_factor, repeats, np.random.default_rng(seed)).metrics
+    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
+    return Resampler(table, repeats=repeats, seed=seed).draws(table, **options).metrics
 
 
 def intervals(
@@ -95,8 +148,9 @@ def intervals(
     Returns:
         (low, high) by metric; NaN where a prediction was NaN or fewer than :data:`MIN_SCENES` scenes define the metric.
     """
-    draws = _draw(table, averaging, silog_lambda, silog_factor, repeats, np.random.default_rng(seed))
-    return {name: _interval(values, draws.scenes[name]) for name, values in draws.metrics.items()}
+    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
+    draws = Resampler(table, repeats=repeats, seed=seed).draws(table, **options)
+    return {name: interval_of(values, draws.scenes[name]) for name, values in draws.metrics.items()}
 
 
 def paired_differences(
@@ -125,8 +179,9 @@ def paired_differences(
             f"no paired comparison: the {len(a.ids)} and {len(b.ids)} rows are not of the same images, scenes and "
             "pixels in the same order. Compare them as different images."
         )
-    options = (averaging, silog_lambda, silog_factor)
-    draws = [_draw(table, *options, repeats, np.random.default_rng(seed)) for table in (a, b)]
+    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
+    resampler = Resampler(a, repeats=repeats, seed=seed)
+    draws = [resampler.draws(table, **options) for table in (a, b)]
     return _differences(a, b, draws[0], draws[1], options)
 
 
@@ -148,8 +203,10 @@ def unpaired_differences(
     Returns:
         For each metric of both; its interval is NaN as in :func:`intervals`.
     """
-    options = (averaging, silog_lambda, silog_factor)
-    draws = [_draw(table, *options, repeats, np.random.default_rng([seed, i])) for i, table in enumerate((a, b))]
+    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
+    draws = [
+        Resampler(table, repeats=repeats, seed=[seed, i]).draws(table, **options) for i, table in enumerate((a, b))
+    ]
     return _differences(a, b, draws[0], draws[1], options)
 
 
@@ -173,63 +230,31 @@ def _scenes(table: ImageTable) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     return np.array(scenes, dtype=np.intp), counted
 
 
-def _draw(
-    table: ImageTable,
-    averaging: str,
-    silog_lambda: float,
-    silog_factor: float,
-    repeats: int,
-    generator: np.random.Generator,
-) -> _Draws:
-    scene, counted = _scenes(table)
-    count = int(scene.max(initial=-1)) + 1
-    columns = additive(table, averaging=averaging)
-    # [scenes, 2 metrics]: sums of each scene, so that a draw costs scenes and not images
-    flat = [row[counted] for column in columns.values() for row in column]
-    per_scene = np.stack([np.bincount(scene, weights=row, minlength=count) for row in flat], axis=1)
-    drawn = np.zeros((repeats, len(flat)))
-    if count:
-        with np.errstate(invalid="ignore"):  # 0 times infinity
-            for part in np.array_split(drawn, math.ceil(repeats * count / MOST_COUNTS)):
-                part[:] = generator.multinomial(count, np.full(count, 1 / count), size=len(part)) @ per_scene
-    sums = dict(zip(columns, drawn.reshape(repeats, -1, 2).transpose(1, 2, 0), strict=True))
-    metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
-    defined = dict(zip(columns, np.count_nonzero(per_scene[:, 1::2], axis=0).tolist(), strict=True))
-    return _Draws(metrics, {name: defined[name] for name in metrics})
-
-
 def _differences(
-    a: ImageTable, b: ImageTable, draws_a: _Draws, draws_b: _Draws, options: tuple[str, float, float]
+    a: ImageTable, b: ImageTable, draws_a: Draws, draws_b: Draws, options: dict[str, Any]
 ) -> dict[str, Difference]:
-    averaging, silog_lambda, silog_factor = options
-    before, after = (
-        summarise(table, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor) for table in (a, b)
-    )
+    before, after = (summarise(table, **options) for table in (a, b))
     differences = {}
     for name in before:
         if name in after:
             scenes = min(draws_a.scenes[name], draws_b.scenes[name])
-            low, high = _interval(draws_b.metrics[name] - draws_a.metrics[name], scenes)
+            low, high = interval_of(draws_b.metrics[name] - draws_a.metrics[name], scenes)
             differences[name] = Difference(after[name] - before[name], low, high)
     return differences
 
 
-def _interval(values: Floats, scenes: int) -> tuple[float, float]:
-    """Return the percentiles of draws; those that are NaN for want of an image that defines the metric are left out."""
+def interval_of(values: Floats, scenes: int) -> tuple[float, float]:
+    """Return the expanded percentile interval of draws.
+
+    Args:
+        values: [repeats] a metric, or a difference, of the drawn sets; those that are NaN for want of an image that
+            defines the metric are left out.
+        scenes: how many scenes define it; fewer than :data:`MIN_SCENES` give NaN.
+    """
     values = values[~np.isnan(values)]
     if scenes < MIN_SCENES or not values.size:
         return math.nan, math.nan
-    tail = 100 * NormalDist().cdf(-math.sqrt(scenes / (scenes - 1)) * _student(scenes - 1))
+    tail = 100 * NormalDist().cdf(-math.sqrt(scenes / (scenes - 1)) * student_quantile(scenes - 1, level=LEVEL))
     with np.errstate(invalid="ignore"):  # between infinities
         low, high = np.percentile(values, [tail, 100 - tail])
     return float(low), float(high)
-
-
-def _student(freedom: int) -> float:
-    """Quantile of Student's t that leaves (1 - LEVEL) / 2 above it.
-
-    By its expansion in 1 / freedom (Abramowitz and Stegun 1964, 26.7.5): 0.3 % low at 4 degrees, 0.03 % at 7.
-    """
-    z = NormalDist().inv_cdf(0.5 + LEVEL / 2)
-    terms = (z, (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
-    return sum(term / float(freedom) ** power for power, term in enumerate(terms))

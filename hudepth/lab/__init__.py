@@ -1,0 +1,1 @@
+"""The numbers of a sweep: rows, intervals and differences, without a network."""
