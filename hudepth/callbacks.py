@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -119,6 +121,8 @@ class Interrupt(Callback):
 
     Raised wherever Python happens to be, a KeyboardInterrupt can be lost: in the callback of a weak reference, of which
     drawing has many, it is printed and ignored, and training goes on.
+
+    A worker of a launcher that was killed ends in the same way, so that the sweep can go on in another process.
     """
 
     def __init__(self) -> None:
@@ -144,17 +148,22 @@ class Interrupt(Callback):
         if self._asked:
             raise KeyboardInterrupt
         self._asked = True
-        log.info("stopping after this batch; Ctrl-C again stops at once")
+        log.warning("stopping after this batch; Ctrl-C again stops at once")
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Stop here, if asked to."""
-        if self._asked:
+        if self._asked or _orphaned():
             raise KeyboardInterrupt
 
     def on_validation_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Stop here, if asked to."""
-        if self._asked:
-            raise KeyboardInterrupt
+        self.on_train_batch_end(trainer, pl_module)
+
+
+def _orphaned() -> bool:
+    """Whether this is a worker process whose parent is gone."""
+    parent = multiprocessing.parent_process()  # of a process of a pool; a shell's child has none
+    return parent is not None and os.getppid() != parent.pid
 
 
 class PanelPictures(Callback):

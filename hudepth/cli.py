@@ -18,6 +18,17 @@ ADDED_GROUPS = ("experiment", "sweep")
 VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "figures", "paper")}
 """The first word after the console scripts that can do several things."""
 
+LAUNCHERS = {
+    "joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "submitit": "slurm", "ray": "ray",
+}  # fmt: skip
+    "joblib": "joblib",
+    "submitit_local": "slurm",
+    "submitit_slurm": "slurm",
+    "submitit": "slurm",
+    "ray": "ray",
+}
+"""Ways to run the jobs of a sweep, and the extra of this package that installs each."""
+
 
 def train() -> int:
     """Run ``hudepth-train``."""
@@ -101,30 +112,31 @@ def _run_hydra(task: str) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing; one_line() words the error
     import hydra
     from hydra.core.hydra_config import HydraConfig
+    from hydra.core.plugins import Plugins
     from hydra.types import RunMode
 
-    errors: dict[int, Exception] = {}
+    if task == "train":
+        from hydra_plugins.hudepth import Sweep
 
-    def job(cfg: Any) -> Any:
+        Plugins.instance().register(Sweep)
+    errors: list[Exception] = []
+
+    def job(cfg: Any) -> Any:  # pickled by launchers that run jobs in other processes
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            return importlib.import_module("hudepth.tasks.job").run_job(cfg)
         from hudepth.console import setup_logging
 
         setup_logging()
-        sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
-        number = HydraConfig.get().job.num if sweeping else -1
         try:
             run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.tasks.{task}"), task)
             return run(cfg)
-        except Exception as error:  # kept from Hydra, which would print it in its own way and hide all but the first
-            errors[number] = error
-            if sweeping:
-                print(f"hudepth-{task}: job {number}: {one_line(error, task)}", file=sys.stderr)
+        except Exception as error:  # kept from Hydra, which would print it in its own way
+            errors.append(error)
             return None
 
     hydra.main(config_path="pkg://hudepth.conf", config_name=task, version_base="1.3")(job)()
-    if -1 in errors:
-        raise errors[-1]
     if errors:
-        raise ConfigError(f"{len(errors)} jobs failed: {', '.join(map(str, errors))}. What each said stands above.")
+        raise errors[0]
     return 0
 
 
@@ -160,8 +172,11 @@ def _config_line(error: BaseException, task: str) -> str | None:
     text = str(error)
     if found := re.search(r"Could not find '([^']+)'", text):
         group, _, name = found[1].rpartition("/")
+        if group == "hydra/launcher" and name in LAUNCHERS:
+            return f"{group}={name}: its package is not installed. Run pip install 'hudepth[{LAUNCHERS[name]}]'."
         options = options_of(group)
         if options:
+            options += [each for each in (*LAUNCHERS, "basic") if group == "hydra/launcher"]
             return f"{group}: no '{name}'.{did_you_mean(name, options)} Pass one of {', '.join(options)}."
     if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
         key = found[1] or getattr(error, "full_key", None) or found[2]

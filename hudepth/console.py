@@ -26,9 +26,16 @@ class _CurrentStderr(logging.Handler):
         print(self.format(record), file=sys.stderr, flush=True)
 
 
-def setup_logging() -> None:
-    """Send hudepth's log lines to standard error, and nowhere else."""
-    log.handlers[:] = [_CurrentStderr()]
+def setup_logging(level: int = logging.INFO, *, prefix: str = "") -> None:
+    """Send hudepth's log lines to standard error, and nowhere else.
+
+    Args:
+        level: of the lines that are shown; a run's own log has all from INFO on.
+        prefix: before each of them.
+    """
+    handler = _CurrentStderr(level)
+    handler.setFormatter(logging.Formatter(f"{prefix.replace('%', '%%')}%(message)s"))
+    log.handlers[:] = [handler]
     log.setLevel(logging.INFO)
     log.propagate = False
 

@@ -26,6 +26,19 @@ class TrainingError(HudepthError):
     """Training that cannot go on, for example because its loss is not finite."""
 
 
+class Pruned(Exception):  # noqa: N818 - no error
+    """A search ended this training early, since others were better at the same epoch.
+
+    Args:
+        message: for the log.
+        value: of the monitored metric.
+    """
+
+    def __init__(self, message: str, value: float) -> None:
+        super().__init__(message)
+        self.value = value
+
+
 def did_you_mean(name: str, choices: Iterable[str]) -> str:
     """Return ``" Did you mean 'x'?"`` for the choice closest to ``name``, or an empty string if none is close.
 

@@ -119,6 +119,10 @@ def write_status(path: Path, state: str, **more: Any) -> None:
     write_json(path / "status.json", {"state": state, "time": now, "pid": os.getpid(), **more})
 
 
+class HeldError(ConfigError):
+    """Another process works in a run directory."""
+
+
 STATES = ("running", "finished", "failed", "interrupted", "pruned")
 LOCK = ".lock"
 
@@ -132,14 +136,23 @@ def held(path: Path, *, timeout_s: float = 0) -> Iterator[None]:
         timeout_s: how long to wait for a process that is already at it.
 
     Raises:
-        ConfigError: if one still is.
+        HeldError: if one still is.
+        ConfigError: if the folder cannot be written.
     """
     lock = FileLock(path / LOCK)
     try:
-        lock.acquire(timeout=timeout_s)
+        try:
+            lock.acquire(timeout=min(timeout_s, 1))
+        except Timeout:
+            if timeout_s <= 1:
+                raise
+            log.info("waiting for process %s to leave '%s'", read_status(path).get("pid"), path)
+            lock.acquire(timeout=timeout_s)
+    except OSError as error:
+        raise ConfigError(f"'{path}' cannot be written ({error.strerror}). Pass a folder you can write to.") from error
     except Timeout:
-        by = _read_status(path).get("pid", "unknown")
-        raise ConfigError(
+        by = read_status(path).get("pid", "unknown")
+        raise HeldError(
             f"'{path}' is being worked on by another process (number {by}). Wait for it, or end it."
         ) from None
     try:
@@ -154,7 +167,7 @@ def state(path: Path) -> tuple[str, str]:
     Returns:
         One of :data:`STATES`; a run that says it is running but is held by no process was killed: ``interrupted``.
     """
-    status = _read_status(path)
+    status = read_status(path)
     found = str(status.get("state"))
     if found not in STATES:
         return "interrupted", ""
@@ -167,7 +180,8 @@ def state(path: Path) -> tuple[str, str]:
     return found, str(status.get("error") or "")
 
 
-def _read_status(path: Path) -> dict[str, Any]:
+def read_status(path: Path) -> dict[str, Any]:
+    """Read status.json as it stands; empty if there is none or it is damaged."""
     try:
         status = json.loads((path / "status.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

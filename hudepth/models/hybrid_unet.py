@@ -89,17 +89,22 @@ class HybridUNet(nn.Module):
         return unit_depth
 
 
-def check_size(height: int, width: int) -> None:
-    """Check that the network can take images of this size.
+def check_size(height: int, width: int, *, stride: int = STRIDE) -> None:
+    """Check that a network can take images of this size.
+
+    Args:
+        height: of the images [pixels].
+        width: of the images [pixels].
+        stride: side of the square of pixels that one position of the network's deepest map stands for.
 
     Raises:
-        ConfigError: if a side is not a positive multiple of 16; the message computes the nearest sizes.
+        ConfigError: if a side is not a positive multiple of ``stride``; the message computes the nearest sizes.
     """
-    if height < STRIDE or width < STRIDE or height % STRIDE or width % STRIDE:
-        below = [max(STRIDE, side // STRIDE * STRIDE) for side in (height, width)]
-        above = [max(STRIDE, -(-side // STRIDE) * STRIDE) for side in (height, width)]
+    if height < stride or width < stride or height % stride or width % stride:
+        below = [max(stride, side // stride * stride) for side in (height, width)]
+        above = [max(stride, -(-side // stride) * stride) for side in (height, width)]
         nearest = " or ".join(dict.fromkeys(f"[{h},{w}]" for h, w in (below, above)))
         raise ConfigError(
             f"data.size: images of {height} x {width} (height x width), but both sides must be multiples of "
-            f"{STRIDE}. Pass data.size={nearest}."
+            f"{stride}. Pass data.size={nearest}."
         )

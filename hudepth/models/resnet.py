@@ -1,4 +1,4 @@
-"""ResNet-18 up to and including layer3: the encoder of table A1 (He et al., CVPR 2016).
+"""ResNet-18 up to and including layer3, the encoder of table A1, or layer4 (He et al., CVPR 2016).
 
 Parameter names are torchvision's, so that its ImageNet file loads as it is.
 """
@@ -7,20 +7,24 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 from urllib.error import URLError
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hudepth.console import log
 from hudepth.errors import CheckpointError, did_you_mean
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 """torchvision's ResNet18_Weights.IMAGENET1K_V1; the name carries the first digits of the file's sha256."""
 
-IGNORED_PREFIXES = ("layer4.", "fc.")
-"""Parts of a full ResNet-18 file that the trunk does not have."""
+LAYER4 = "layer4."
+"""Prefix of the layer that table A1 leaves out."""
+
+CLASSIFIER = "fc."
+"""Prefix of the part of a full ResNet-18 file that no trunk has."""
 
 
 class Features(NamedTuple):
@@ -30,6 +34,8 @@ class Features(NamedTuple):
     layer1: Float[Tensor, "b 64 h/4 w/4"]
     layer2: Float[Tensor, "b 128 h/8 w/8"]
     layer3: Float[Tensor, "b 256 h/16 w/16"]
+    layer4: Float[Tensor, "b 512 h/32 w/32"] | None = None
+    """None where the trunk ends with layer3."""
 
 
 class BasicBlock(nn.Module):
@@ -57,17 +63,18 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18Trunk(nn.Module):
-    """ResNet-18 without layer4 and fc.
+    """ResNet-18 without fc, and by default without layer4.
 
     Args:
         weights: ``imagenet`` (torchvision's file, downloaded once and checked by its hash), the path of a file with
             torchvision's parameter names, or ``none`` for random values.
+        layers: 3 ends with layer3 (table A1), 4 with layer4 (the paper's text).
 
     Raises:
         CheckpointError: if the weights cannot be had or do not fit.
     """
 
-    def __init__(self, *, weights: str | None = None) -> None:
+    def __init__(self, *, weights: str | None = None, layers: Literal[3, 4] = 3) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
@@ -76,6 +83,9 @@ class ResNet18Trunk(nn.Module):
         self.layer1 = nn.Sequential(BasicBlock(64, 64), BasicBlock(64, 64))
         self.layer2 = nn.Sequential(BasicBlock(64, 128, stride=2), BasicBlock(128, 128))
         self.layer3 = nn.Sequential(BasicBlock(128, 256, stride=2), BasicBlock(256, 256))
+        self.layer4: nn.Sequential | None = None
+        if layers == 4:
+            self.layer4 = nn.Sequential(BasicBlock(256, 512, stride=2), BasicBlock(512, 512))
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -83,15 +93,18 @@ class ResNet18Trunk(nn.Module):
             load_trunk_weights(self, weights)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Features:
-        """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size."""
+        """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size, and at 1/32 with layer4."""
         stem = self.relu(self.bn1(self.conv1(image)))
         layer1 = self.layer1(self.maxpool(stem))
         layer2 = self.layer2(layer1)
-        return Features(stem, layer1, layer2, self.layer3(layer2))
+        layer3 = self.layer3(layer2)
+        return Features(stem, layer1, layer2, layer3, None if self.layer4 is None else self.layer4(layer3))
 
 
 def load_trunk_weights(trunk: ResNet18Trunk, weights: str) -> None:
-    """Load ImageNet weights into ``trunk``; layer4 and fc in the file are ignored, all else must fit.
+    """Load ImageNet weights into ``trunk``; fc and a layer4 that the trunk lacks are ignored, all else must fit.
+
+    A trunk with layer4 also takes a file without: its layer4 then stays random, which a line of the log says.
 
     Args:
         trunk: the module to fill.
@@ -101,8 +114,12 @@ def load_trunk_weights(trunk: ResNet18Trunk, weights: str) -> None:
         CheckpointError: if the file cannot be downloaded or read, or a tensor is missing, unknown or misshapen.
     """
     state = _download_imagenet() if weights == "imagenet" else _read_weights(Path(weights).expanduser())
-    state = {name: value for name, value in state.items() if not name.startswith(IGNORED_PREFIXES)}
     own = trunk.state_dict()
+    ignored = (CLASSIFIER,) if trunk.layer4 is not None else (CLASSIFIER, LAYER4)
+    state = {name: value for name, value in state.items() if not name.startswith(ignored)}
+    without_layer4 = not any(name.startswith(LAYER4) for name in state)
+    if without_layer4:
+        state |= {name: value for name, value in own.items() if name.startswith(LAYER4)}
     missing = sorted(own.keys() - state.keys())
     unknown = sorted(state.keys() - own.keys())
     misshapen = sorted(name for name in own.keys() & state.keys() if own[name].shape != state[name].shape)
@@ -113,6 +130,8 @@ def load_trunk_weights(trunk: ResNet18Trunk, weights: str) -> None:
                 "Pass a ResNet-18 file with torchvision's parameter names, or model.weights=none."
             )
     trunk.load_state_dict(state)
+    if trunk.layer4 is not None and without_layer4:
+        log.warning("model.weights: '%s' has no layer4, which starts at random", weights)
 
 
 def _read_weights(path: Path) -> dict[str, Tensor]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
@@ -35,17 +38,21 @@ from hudepth.checkpoint import AtomicCheckpointIO, load_checkpoint
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
-from hudepth.errors import ConfigError, HudepthError
+from hudepth.errors import ConfigError, HudepthError, Pruned
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
 from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, check_monitor
 from hudepth.tasks.common import build_data, build_protocols, without_known_warnings
 from hudepth.tasks.config import plain
+from hudepth.tasks.pruning import TrialPruner
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.score import score_checkpoint
+from hudepth.tasks.search import TRIAL_ENV
 
 RUN_ENV = "HUDEPTH_RUN"
 """Tells the processes of a distributed run which run directory the first one made."""
+HELD_S = 30
+"""How long to wait for another process to leave a run directory: one whose sweep was killed ends after its batch."""
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -62,22 +69,44 @@ def train(cfg: DictConfig) -> float | None:
     """
     overrides = [typed.removeprefix("++") for typed in HydraConfig.get().overrides.task]
     if cfg.resume:
+        if _sweeping():
+            raise ConfigError("resume: is of one run. To go on with a sweep, pass sweep_dir=<its folder>.")
         path = Path(cfg.resume).expanduser().resolve()
         config = resumed_config(path, overrides)
         check_config(config)
+        resumed: list[str] | None = overrides
     else:
         config = plain(cfg)
         check_config(config)
+        if not _sweeping() and (config["variant"] or config["sweep_dir"]):
+            key = "variant" if config["variant"] else "sweep_dir"
+            raise ConfigError(f"{key}: is of sweeps. Pass +sweep=<name> too, or -m, or leave it out.")
         path = _run_path(config)
-        if _first_process():
-            environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
-            run_dir.write_start(path, config=config, overrides=overrides, environment=environment)
+        resumed = [] if (path / run_dir.CHECKPOINTS / run_dir.LAST).is_file() else None  # a job of a sweep that goes on
     if not _first_process():
         log.setLevel(logging.WARNING)
+    with _held(path), _shared_with_children(path), run_dir.logged_to(path / "train.log"):
+        if resumed is None and _first_process():
+            environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
+            run_dir.write_start(path, config=config, overrides=overrides, environment=environment)
+        return _run(config, path, resumed=resumed)
+
+
+@contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Keep other processes from the run directory, but for those of the same distributed run."""
+    if not _first_process():
+        yield
+        return
+    with run_dir.held(path, timeout_s=HELD_S):
+        yield
+
+
+@contextmanager
+def _shared_with_children(path: Path) -> Iterator[None]:
     os.environ[RUN_ENV] = str(path)
     try:
-        with run_dir.logged_to(path / "train.log"):
-            return _run(config, path, resumed=overrides if cfg.resume else None)
+        yield
     finally:
         os.environ.pop(RUN_ENV, None)
 
@@ -92,12 +121,16 @@ def _status(path: Path, state: str, **more: Any) -> None:
         run_dir.write_status(path, state, **more)
 
 
+def _sweeping() -> bool:
+    """Whether this run is a job of a sweep: alone in its process, whatever cluster that is on, and silent."""
+    return bool(HydraConfig.get().mode == RunMode.MULTIRUN)
+
+
 def _run_path(config: dict[str, Any]) -> Path:
     if RUN_ENV in os.environ:
         return Path(os.environ[RUN_ENV])
-    hydra = HydraConfig.get()
-    if hydra.mode == RunMode.MULTIRUN:
-        path = Path(hydra.runtime.output_dir)
+    if _sweeping():
+        path = Path(HydraConfig.get().runtime.output_dir)
         path.mkdir(parents=True, exist_ok=True)
         return path.resolve()
     return run_dir.create(config["paths"]["runs"], str(config["name"]))
@@ -116,6 +149,10 @@ def _run(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
         raise ConfigError(
             f"{error.strerror or error} ('{error.filename or path}'). See {path / 'train.log'}."
         ) from error
+    except Pruned as pruned:
+        _status(path, "pruned", best=pruned.value)
+        log.info("%s", pruned)
+        return pruned.value
     except (KeyboardInterrupt, SystemExit):
         _status(path, "interrupted")
         log.info("interrupted; continue with: hudepth-train resume=%s", path)
@@ -221,8 +258,10 @@ def _callbacks(config: dict[str, Any], path: Path, datamodule: DepthDataModule) 
                 max_depth_m=datamodule.max_depth_m,
             )
         )
-    if shows_progress():
+    if shows_progress() and not _sweeping():
         callbacks.append(RichProgressBar(leave=False))
+    if trial := os.environ.get(TRIAL_ENV):
+        callbacks.append(TrialPruner(trial, monitor=monitor))
     if options["early_stopping"]:
         callbacks.append(EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"]))
     callbacks += [instantiate(extra, trust=config["trust"], only=Callback) for extra in options["extra"]]
@@ -244,10 +283,10 @@ def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> T
             **config["trainer"],
             logger=loggers or False,
             callbacks=callbacks,
-            plugins=[AtomicCheckpointIO()],
+            plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if _sweeping() else [])],
             default_root_dir=path,
             enable_model_summary=False,
-            enable_progress_bar=shows_progress(),
+            enable_progress_bar=shows_progress() and not _sweeping(),
             num_sanity_val_steps=0,
             use_distributed_sampler=False,  # the data module shards by itself, exactly
             log_every_n_steps=1,  # all is logged by epoch; a larger number only makes Lightning warn

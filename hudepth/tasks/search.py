@@ -1,0 +1,216 @@
+"""A search over configurations with optuna: each trial is a run of the sweep, and the study a file beside the runs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
+
+from hudepth import run_dir
+from hudepth.errors import ConfigError, did_you_mean
+from hudepth.sweeps import FINISHED, PRUNED
+from hudepth.tasks.config import whole_number
+from hudepth.tasks.sweep_jobs import Job, find_done
+from hudepth.tasks.sweep_progress import say
+
+if TYPE_CHECKING:
+    import optuna
+
+    from hudepth.tasks.sweep import Sweep
+
+STUDY_FILE = "study.log"
+STUDY = "hudepth"
+TRIAL_ENV = "HUDEPTH_TRIAL"
+"""``<number>:<study file>``, in the environment of a job that is a trial."""
+OPTIONS: dict[str, Any] = {
+    "trials": 30, "sampler": "tpe", "seed": 0, "startup_trials": 8, "prune": True, "warmup_epochs": 2,
+}  # fmt: skip
+"""Keys of ``hydra.sweeper.search`` and their defaults."""
+
+
+def search(
+    sweep: Sweep, folder: Path, *, typed: Sequence[Override], params: Sequence[Override], options: Mapping[str, Any]
+) -> None:
+    """Run trials until there are as many as asked for; trials that were killed go on first.
+
+    Args:
+        sweep: composes and launches.
+        folder: of the sweep; the study lies in it.
+        typed: overrides on the command line.
+        params: overrides of the sweep's file.
+        options: see :data:`OPTIONS`.
+
+    Raises:
+        ConfigError: if optuna is not installed, an option is unknown, nothing is searched over, or all trials failed.
+    """
+    chosen = check_options(options)
+    mine = {override.key_or_group for override in typed}
+    every = [*(override for override in params if override.key_or_group not in mine), *typed]
+    constants = [str(override.input_line) for override in every if not override.is_sweep_override()]
+    space = {override.get_key_element(): distribution(override) for override in every if override.is_sweep_override()}
+    if not space:
+        raise ConfigError("search: nothing to search over. Give a key a range, as in 'loss.boundary=interval(0.3,30)'.")
+    direction = "minimize" if sweep.master.mode == "min" else "maximize"
+    study = open_study(str(folder / STUDY_FILE), chosen, direction=direction)
+    at_once = max(1, int(sweep.master.hydra.launcher.get("n_jobs") or 1))
+    jobs: list[Job] = []
+    while trials := _next_trials(study, space, at_once, int(chosen["trials"])):
+        batch = [_job(trial, constants, folder) for trial in trials]
+        batch = find_done(sweep.compose(batch), folder)
+        if all(job.config is None for job in batch) and not jobs:
+            raise ConfigError(batch[0].error)
+        sweep.record([*jobs, *batch], folder)
+        sweep.launch([job for job in batch if job.config is not None and not job.finished], folder)
+        open_ = [job.name for job in batch if not _tell(study, job, folder)]
+        if open_:  # a launcher lost its process; to try again at once could go on for ever
+            raise ConfigError(f"search: {open_[0]} did not end. Give sweep_dir={folder} again to go on with it.")
+        jobs += batch
+    _say_best(study, folder, monitor=str(sweep.master.monitor))
+
+
+def check_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all options of a search.
+
+    Raises:
+        ConfigError: for an unknown key or a value out of range.
+    """
+    for key in options:
+        if key not in OPTIONS:
+            raise ConfigError(
+                f"hydra.sweeper.search: no '{key}'.{did_you_mean(key, OPTIONS)} It takes {', '.join(OPTIONS)}."
+            )
+    chosen = {**OPTIONS, **options}
+    for key, least in (("trials", 1), ("seed", 0), ("startup_trials", 0), ("warmup_epochs", 0)):
+        whole_number(chosen, key, default=OPTIONS[key], least=least)
+    if chosen["sampler"] not in ("tpe", "random"):
+        raise ConfigError(f"hydra.sweeper.search.sampler: no '{chosen['sampler']}'. Pass tpe or random.")
+    return chosen
+
+
+def distribution(override: Override) -> Any:
+    """Return the optuna distribution for an override like ``loss.boundary=tag(log,interval(0.3,30))``.
+
+    Raises:
+        ConfigError: if it is no range that optuna knows.
+    """
+    optuna_ = _optuna()
+    value = override.value()
+    log = "log" in getattr(value, "tags", ())
+    try:
+        if isinstance(value, IntervalSweep):
+            low, high = float(value.start or 0), float(value.end or 0)
+            return optuna_.distributions.FloatDistribution(low, high, log=log)
+        if isinstance(value, RangeSweep):
+            start, stop, step = value.start or 0, value.stop or 0, value.step
+            if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
+                last = stop - 1 - (stop - 1 - start) % step  # Hydra's ranges, like Python's, end before stop
+                return optuna_.distributions.IntDistribution(start, last, step=1 if log else step, log=log)
+            return optuna_.distributions.FloatDistribution(float(start), float(stop), step=float(step))
+        if isinstance(value, ChoiceSweep):
+            return optuna_.distributions.CategoricalDistribution(list(override.sweep_string_iterator()))
+    except ValueError as error:
+        raise ConfigError(f"'{override.input_line}': {error}") from error
+    raise ConfigError(f"'{override.input_line}': pass interval(low,high), range(first,end,step) or choice(a,b).")
+
+
+def open_study(file: str, options: Mapping[str, Any] = OPTIONS, *, direction: str = "minimize") -> optuna.study.Study:
+    """Open the study in a file that many processes may write to and a kill cannot damage; make it if there is none.
+
+    Raises:
+        ConfigError: if optuna is not installed, or the file is none of its own.
+    """
+    optuna_ = _optuna()
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+
+    logging.getLogger("optuna").setLevel(logging.WARNING)
+    pruner: optuna.pruners.BasePruner = optuna_.pruners.NopPruner()
+    if options["prune"]:
+        pruner = optuna_.pruners.MedianPruner(options["startup_trials"], options["warmup_epochs"])
+    try:
+        storage = JournalStorage(JournalFileBackend(file, lock_obj=JournalFileOpenLock(file)))
+        study: optuna.study.Study = optuna_.create_study(
+            storage=storage, study_name=STUDY, load_if_exists=True, direction=direction, pruner=pruner
+        )
+        # another seed for each trial: a study that goes on should not draw again what it drew at first
+        seed = int(options["seed"]) + len(study.get_trials(deepcopy=False))
+    except Exception as error:
+        why = " ".join(str(error).split())
+        raise ConfigError(f"search: '{file}' is no study that can go on ({why}). Pass another sweep_dir.") from error
+    samplers = optuna_.samplers
+    study.sampler = (
+        samplers.RandomSampler(seed=seed)
+        if options["sampler"] == "random"
+        else samplers.TPESampler(seed=seed, n_startup_trials=options["startup_trials"], constant_liar=True)
+    )
+    return study
+
+
+def _optuna() -> Any:
+    try:
+        import optuna
+    except ImportError:
+        raise ConfigError("search: optuna is not installed. Run pip install 'hudepth[search]'.") from None
+    return optuna
+
+
+def _next_trials(
+    study: optuna.study.Study, space: Mapping[str, Any], at_once: int, wanted: int
+) -> list[optuna.trial.Trial]:
+    """Return the trials to run now: those that were killed, or new ones while there are fewer than wanted."""
+    optuna_ = _optuna()
+    every = study.get_trials(deepcopy=False)
+    killed = [each for each in every if each.state == optuna_.trial.TrialState.RUNNING]
+    if killed:
+        return [optuna_.trial.Trial(study, each._trial_id) for each in killed]
+    return [study.ask(dict(space)) for _ in range(min(at_once, wanted - len(every)))]
+
+
+def _job(trial: optuna.trial.Trial, constants: Sequence[str], folder: Path) -> Job:
+    labels = {key.lstrip("+~"): _spelt(value) for key, value in trial.params.items()}
+    overrides = [*constants, *(f"{key}={_spelt(value)}" for key, value in trial.params.items())]
+    env = f"'{trial.number}:{folder / STUDY_FILE}'"
+    return Job((*overrides, f"+hydra.job.env_set.{TRIAL_ENV}={env}"), {"trial": str(trial.number), **labels})
+
+
+def _spelt(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _tell(study: optuna.study.Study, job: Job, folder: Path) -> bool:
+    """Tell the study what came of a trial, and return whether anything did; one that was interrupted stays open."""
+    optuna_ = _optuna()
+    state = run_dir.state(folder / job.folder)[0] if job.config is not None else "failed"
+    number, best = int(job.labels["trial"]), run_dir.read_status(folder / job.folder).get("best")
+    if state == FINISHED and isinstance(best, int | float):
+        study.tell(number, float(best))
+    elif state == PRUNED:
+        study.tell(number, state=optuna_.trial.TrialState.PRUNED)
+    elif state in ("failed", FINISHED):  # finished with a metric that is not finite
+        study.tell(number, state=optuna_.trial.TrialState.FAIL)
+    else:
+        return False
+    return True
+
+
+def _say_best(study: optuna.study.Study, folder: Path, *, monitor: str) -> None:
+    """Say which trials were best.
+
+    Raises:
+        ConfigError: if none finished.
+    """
+    states = _optuna().trial.TrialState
+    trials = study.get_trials(deepcopy=False)
+    done = [trial for trial in trials if trial.state == states.COMPLETE]
+    if not done:
+        raise ConfigError(f"search: none of {len(trials)} trials finished. See {folder}/<job>/train.log.")
+    sign = 1 if study.direction.name == "MINIMIZE" else -1
+    done.sort(key=lambda trial: sign * float(trial.value or 0))
+    pruned = sum(trial.state == states.PRUNED for trial in trials)
+    say(f"search: {len(done)} trials finished, {pruned} pruned, {len(trials) - len(done) - pruned} failed; in {folder}")
+    for place, trial in enumerate(done[:5], start=1):
+        values = " ".join(f"{key}={_spelt(value)}" for key, value in trial.params.items())
+        say(f"  {place}. {monitor} {float(trial.value or 0):.4f}: {values} (trial {trial.number})")
