@@ -21,12 +21,6 @@ VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "f
 LAUNCHERS = {
     "joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "submitit": "slurm", "ray": "ray",
 }  # fmt: skip
-    "joblib": "joblib",
-    "submitit_local": "slurm",
-    "submitit_slurm": "slurm",
-    "submitit": "slurm",
-    "ray": "ray",
-}
 """Ways to run the jobs of a sweep, and the extra of this package that installs each."""
 
 
