@@ -69,7 +69,7 @@ class Resampler:
 
     def __init__(self, table: ImageTable, *, repeats: int = REPEATS, seed: int | Sequence[int] = SEED) -> None:
         self._scene, self._counted = _scenes(table)
-        self._repeats, self._seed = repeats, seed
+        self.repeats, self.seed = repeats, seed
         self._count = int(self._scene.max(initial=-1)) + 1
         self._kept = list(self._drawn()) if repeats * self._count <= MOST_COUNTS else None
 
@@ -77,8 +77,8 @@ class Resampler:
         """Yield how often each scene was drawn, [some repeats, scenes] at a time."""
         if not self._count:
             return
-        generator, share = np.random.default_rng(self._seed), np.full(self._count, 1 / self._count)
-        for part in np.array_split(np.arange(self._repeats), math.ceil(self._repeats * self._count / MOST_COUNTS)):
+        generator, share = np.random.default_rng(self.seed), np.full(self._count, 1 / self._count)
+        for part in np.array_split(np.arange(self.repeats), math.ceil(self.repeats * self._count / MOST_COUNTS)):
             yield generator.multinomial(self._count, share, size=len(part)).astype(np.float64)
 
     def draws(
@@ -96,13 +96,13 @@ class Resampler:
         # [scenes, 2 metrics]: sums of each scene, so that a draw costs scenes and not images
         flat = [row[self._counted] for column in columns.values() for row in column]
         per_scene = np.stack([np.bincount(self._scene, weights=row, minlength=self._count) for row in flat], axis=1)
-        drawn = np.zeros((self._repeats, len(flat)))
+        drawn = np.zeros((self.repeats, len(flat)))
         start = 0
         for counts in self._kept if self._kept is not None else self._drawn():
             with np.errstate(invalid="ignore"):  # 0 times infinity
                 drawn[start : start + len(counts)] = counts @ per_scene
             start += len(counts)
-        sums = dict(zip(columns, drawn.reshape(self._repeats, -1, 2).transpose(1, 2, 0), strict=True))
+        sums = dict(zip(columns, drawn.reshape(self.repeats, -1, 2).transpose(1, 2, 0), strict=True))
         metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
         defined = dict(zip(columns, np.count_nonzero(per_scene[:, 1::2], axis=0).tolist(), strict=True))
         return Draws(metrics, {name: defined[name] for name in metrics})

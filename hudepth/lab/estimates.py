@@ -1,0 +1,142 @@
+"""Means over seeds, differences between rows, and how sure both are.
+
+Two things could have come out otherwise, and each has an interval of its own:
+
+    seeds    another seed gives another network: Student's t over the seeds' values, or over their paired differences
+    scenes   another test set has other scenes: bootstrap of the mean over the seeds, every seed with the same draws
+
+A difference is shown only if both intervals, where there are both, leave out 0. They are 95 % intervals of one metric
+and one row each: among many rows some differ by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hudepth.metrics.bootstrap import LEVEL, Draws, interval_of
+from hudepth.metrics.student import student_quantile
+from hudepth.metrics.summary import higher_is_better
+
+BETTER, WORSE, NOT_SHOWN = "better", "worse", "not shown"
+
+
+@dataclass(frozen=True)
+class Interval:
+    """From low to high; NaN if there is none."""
+
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def known(self) -> bool:
+        """Whether there is one."""
+        return not (math.isnan(self.low) or math.isnan(self.high))
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether 0 lies outside."""
+        return self.low > 0 or self.high < 0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A metric of a row."""
+
+    values: dict[str, float]
+    """By seed."""
+    mean: float
+    """Over seeds; NaN if the metric is undefined for one of them."""
+    seeds: Interval
+    scenes: Interval
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A metric of a row minus that of the reference."""
+
+    value: float
+    """Mean over :attr:`paired`."""
+    seeds: Interval
+    scenes: Interval
+    paired: list[str]
+    """The seeds that both rows have."""
+    verdict: str
+    """``better``, ``worse`` or ``not shown``."""
+
+
+def over_seeds(values: Sequence[float]) -> Interval:
+    """Return the t interval of a mean; none for fewer than two values or where one is not finite."""
+    if len(values) < 2 or not all(math.isfinite(value) for value in values):
+        return Interval()
+    mean = math.fsum(values) / len(values)
+    variance = math.fsum((value - mean) ** 2 for value in values) / (len(values) - 1)
+    half = student_quantile(len(values) - 1, level=LEVEL) * math.sqrt(variance / len(values))
+    return Interval(mean - half, mean + half)
+
+
+def estimate(name: str, values: Mapping[str, float], draws: Mapping[str, Draws]) -> Estimate:
+    """Return a metric of a row.
+
+    Args:
+        name: of the metric.
+        values: the metric by seed; at least one.
+        draws: by seed, of the same images and with the same draws; empty if the seeds were tested on different images.
+    """
+    return Estimate(dict(values), _mean(list(values.values())), over_seeds(list(values.values())), _scenes(name, draws))
+
+
+def contrast(
+    name: str,
+    row: Mapping[str, float],
+    reference: Mapping[str, float],
+    row_draws: Mapping[str, Draws],
+    reference_draws: Mapping[str, Draws],
+) -> Contrast | None:
+    """Return how a row differs from the reference in a metric, paired by seed; None if they have no seed in common.
+
+    Args:
+        name: of the metric.
+        row: its values by seed.
+        reference: those of the reference.
+        row_draws: by seed.
+        reference_draws: the same sets of scenes by seed.
+    """
+    paired = [seed for seed in reference if seed in row]
+    if not paired:
+        return None
+    steps = [row[seed] - reference[seed] for seed in paired]
+    seeds = over_seeds(steps)
+    scenes = _scenes(
+        name,
+        {seed: row_draws[seed] for seed in paired if seed in row_draws},
+        {seed: reference_draws[seed] for seed in paired if seed in reference_draws},
+    )
+    value = _mean(steps)
+    return Contrast(value, seeds, scenes, paired, verdict(name, value, seeds, scenes))
+
+
+def verdict(name: str, value: float, seeds: Interval, scenes: Interval) -> str:
+    """Say what a difference shows: better or worse only if every interval that there is leaves out 0."""
+    known = [interval for interval in (seeds, scenes) if interval.known]
+    if not known or not all(interval.excludes_zero for interval in known):
+        return NOT_SHOWN
+    return BETTER if (value > 0) == higher_is_better(name) else WORSE
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values) if all(map(math.isfinite, values)) else math.nan
+
+
+def _scenes(name: str, draws: Mapping[str, Draws], minus: Mapping[str, Draws] | None = None) -> Interval:
+    """Return the interval of the mean over seeds, of a metric or of its differences."""
+    sides = [*draws.values(), *(minus or {}).values()]
+    if not draws or not all(name in each.metrics for each in sides):
+        return Interval()
+    total = np.mean([each.metrics[name] for each in draws.values()], axis=0)
+    if minus is not None:
+        total = total - np.mean([each.metrics[name] for each in minus.values()], axis=0)
+    return Interval(*interval_of(total, min(each.scenes[name] for each in sides)))
