@@ -57,6 +57,20 @@ def test_every_experiment_changes_something_and_runs_a_step(
     assert list(tmp_path.glob("runs/*/*/status.json"))
 
 
+@pytest.mark.parametrize("model", names("model"))
+def test_every_model_trains_a_step_and_is_tested(
+    model: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HUDEPTH_CACHE", str(tmp_path_factory.getbasetemp() / "conf_cache"))
+    steps = ["trainer.limit_train_batches=1", "trainer.limit_val_batches=1"]
+    # 64: a multiple of what each model asks for, and more than one position of the deepest map for its batch norm
+    monkeypatch.setattr(sys, "argv", ["hudepth-train", f"model={model}", *SMALL, "data.size=[64,64]", *steps])
+    assert cli.train() == 0
+    assert list(tmp_path.glob("runs/*/*/test/eigen/metrics.json"))
+
+
 @pytest.mark.parametrize("name", names("sweep"))
 def test_every_sweep_is_a_multirun_whose_jobs_compose(name: str) -> None:
     text = yaml.safe_load((CONF / "sweep" / f"{name}.yaml").read_text())
