@@ -148,13 +148,13 @@ def held(path: Path, *, timeout_s: float = 0) -> Iterator[None]:
                 raise
             log.info("waiting for process %s to leave '%s'", read_status(path).get("pid"), path)
             lock.acquire(timeout=timeout_s)
-    except OSError as error:
-        raise ConfigError(f"'{path}' cannot be written ({error.strerror}). Pass a folder you can write to.") from error
     except Timeout:
         by = read_status(path).get("pid", "unknown")
         raise HeldError(
             f"'{path}' is being worked on by another process (number {by}). Wait for it, or end it."
         ) from None
+    except OSError as error:
+        raise ConfigError(f"'{path}' cannot be written ({error.strerror}). Pass a folder you can write to.") from error
     try:
         yield
     finally:

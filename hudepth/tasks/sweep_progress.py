@@ -60,7 +60,7 @@ class Progress:
 
     def _look(self) -> None:
         for number, (job, watched) in enumerate(self._jobs.items(), start=1):
-            if news := watched.news():
+            while news := watched.news():
                 say(f"[{number}/{len(self._jobs)}] {job.name}: {news}{self._left()}")
 
     def _left(self) -> str:
@@ -101,6 +101,7 @@ class _Watched:
             epoch, metric = self._last_epoch()
             if epoch != self._seen:
                 self._seen, self._metric = epoch, metric
+                self._began = self._began or time.monotonic()
                 return f"epoch {epoch} of {self.epochs}{metric}{self._time_left()}"
         if self._changed("status.json"):
             status = run_dir.read_status(self.path)

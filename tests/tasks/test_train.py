@@ -74,28 +74,6 @@ def test_experiment_changes_values(command: Command) -> None:
         assert (badcl["optim"]["lr"], badcl["data"]["batch_size"], badcl["seed"]) == (1e-4, 8, 42)
 
 
-def test_multirun_makes_a_run_directory_for_each_job(command: Command, tmp_path: Path) -> None:
-    done = command("train", "-m", *TINY, "name=sweep", "loss=l1,l2", "trainer.max_epochs=1", "test=false")
-    assert done.code == 0, done.err
-    (sweep,) = (tmp_path / "sweeps" / "sweep").iterdir()
-    for job, loss in (("0", "l1"), ("1", "l2")):
-        assert status(sweep / job)["state"] == "finished"
-        assert f"train/{loss}" in history(sweep / job)[0]
-    assert not (tmp_path / "runs").exists()
-
-
-def test_a_failing_job_of_a_sweep_stops_no_other(command: Command, tmp_path: Path) -> None:
-    done = command("train", "-m", *TINY, "name=sweep", "optim.lr=-1,1e-3", "trainer.max_epochs=1", "test=false")
-    assert done.code == 1
-    assert "hudepth-train: job 0: torch.optim.AdamW: Invalid learning rate: -1" in done.err
-    assert done.err.splitlines()[-1] == "hudepth-train: 1 jobs failed: 0. What each said stands above."
-    (sweep,) = (tmp_path / "sweeps" / "sweep").iterdir()
-    assert status(sweep / "0")["state"] == "failed"
-    assert "Invalid learning rate" in status(sweep / "0")["error"]
-    assert "Traceback" in (sweep / "0" / "train.log").read_text()
-    assert status(sweep / "1")["state"] == "finished"
-
-
 def test_a_loss_that_is_not_finite_names_its_batch(command: Command, tmp_path: Path) -> None:
     done = command("train", *TINY, "name=exploding", "optim.lr=1e30", "loss=l2", "model=tiny", "trainer.max_epochs=3")
     assert done.code == 1
