@@ -15,7 +15,7 @@ from hudepth.errors import ConfigError, HudepthError, did_you_mean
 ADDED_GROUPS = ("experiment", "sweep")
 """Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
 
-VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "figures", "paper")}
+VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "sweep", "figures", "paper")}
 """The first word after the console scripts that can do several things."""
 
 LAUNCHERS = {

@@ -8,14 +8,14 @@ ABOUT = {
     "train": "Train a monocular depth model and test its best checkpoint. All goes to runs/<name>/<date_time>/.",
     "test": "Score a checkpoint. It needs nothing but the checkpoint: model, data and split are recorded in it.",
     "data": "Prepare a data set once as a depth store, show what is known of it, or audit it for leaks and units.",
-    "report": "Compare two runs, put several in one table, draw a run's figures, or check every claim of the paper.",
+    "report": "Compare two runs, put several or a whole sweep in one table, draw a run's figures, or check the paper's claims.",
 }
 
 USAGE = {
     "train": "hudepth-train [+experiment=NAME] [group=NAME ...] [key=value ...]",
     "test": "hudepth-test checkpoint=<file | run directory | last> [data=NAME] [protocol=NAME] [key=value ...]",
     "data": "hudepth-data prepare|info|audit data=NAME [data.root=PATH] [key=value ...]",
-    "report": "hudepth-report compare|table|figures|paper [key=value ...]",
+    "report": "hudepth-report compare|table|sweep|figures|paper [key=value ...]",
 }
 
 EXAMPLES = {
@@ -47,6 +47,7 @@ EXAMPLES = {
     "report": (
         ("hudepth-report compare a=runs/badcl/A b=runs/l1/B", "is b better, on the same test images, and where"),
         ("hudepth-report table runs=[A,B,C] protocol=[paper,eigen]", "results side by side, and in what they differ"),
+        ("hudepth-report sweep dir=sweeps/losses/A", "a sweep's variants over their seeds: tables, plots, one page"),
         ("hudepth-report figures run=last", "loss curves and RGB / truth / prediction panels of a run"),
         ("hudepth-report paper", "what the paper claims beside what is measured here and now"),
         ("hudepth-report paper runs=[A,B]", "with runs of yours as evidence"),

@@ -74,7 +74,7 @@ def _draw_images(path: Path, a: Result, b: Result, config: dict[str, Any]) -> No
     runs = {name: result.path.parent.parent for name, result in (("a", a), ("b", b))}
     if not whole_number(config, "panels", default=0) or not all((run / CHECKPOINTS).is_dir() for run in runs.values()):
         return
-    if not all(_of_training_data(result) for result in (a, b)):
+    if not all(of_training_data(result) for result in (a, b)):
         log.warning(
             "no images.png: tested on other data than that of the training, which is what runs know how to open"
         )
@@ -89,7 +89,8 @@ def _draw_images(path: Path, a: Result, b: Result, config: dict[str, Any]) -> No
     save_panels(path, panels)
 
 
-def _of_training_data(result: Result) -> bool:
+def of_training_data(result: Result) -> bool:
+    """Tell whether a network was tested on the data it was trained on, which is what its run knows how to open."""
     trained_on = result.document.get("checkpoint")
     for key in ("trained_on", "fingerprint"):
         trained_on = trained_on.get(key) if isinstance(trained_on, dict) else None

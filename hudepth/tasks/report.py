@@ -10,7 +10,7 @@ from hudepth.tasks.config import plain
 
 
 def report(cfg: DictConfig) -> None:
-    """Run the verb ``compare``, ``table``, ``figures`` or ``paper``.
+    """Run the verb ``compare``, ``table``, ``sweep``, ``figures`` or ``paper``.
 
     Args:
         cfg: what conf/report.yaml and the command line compose to.
@@ -22,12 +22,16 @@ def report(cfg: DictConfig) -> None:
     if isinstance(config["runs"], str):  # runs=x as well as runs=[x]
         config["runs"] = [config["runs"]]
     verb, protocols = config["verb"], [name for name, protocol in (config["protocol"] or {}).items() if protocol]
+    if verb in ("compare", "sweep") and len(protocols) != 1:
+        raise ConfigError(f"protocol: {verb} takes one, not {len(protocols)}. Pass protocol=eigen.")
     if verb == "compare":
         from hudepth.tasks.compare import compare
 
-        if len(protocols) != 1:
-            raise ConfigError(f"protocol: compare takes one, not {len(protocols)}. Pass protocol=eigen.")
         compare({**config, "protocol": protocols[0]})
+    elif verb == "sweep":
+        from hudepth.tasks.sweep_report import sweep_report
+
+        sweep_report({**config, "protocol": protocols[0]})
     elif verb == "table":
         from hudepth.tasks.table import table
 
