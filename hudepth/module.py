@@ -83,7 +83,10 @@ class DepthModule(LightningModule):
         pred = self(batch["image"])
         loss = self.loss(pred, batch["unit_depth"], batch["image"], batch["valid"])
         values = {f"{stage}/total": loss.total.detach(), **{f"{stage}/{k}": v.detach() for k, v in loss.terms.items()}}
-        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(pred))
+        # The batch size as a float: over processes Lightning averages the count of images in the count's own type, and
+        # of 7 images in two processes it would make 3 a process, which is a loss too high by a sixth.
+        size: Any = float(len(pred))
+        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True, batch_size=size)
         if stage == "val":
             depth_m = (x.float() * self.max_depth_m for x in (pred, batch["unit_depth"]))
             self.val_metrics.update(*depth_m, batch["valid"])

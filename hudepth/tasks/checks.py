@@ -10,6 +10,7 @@ from torch import nn
 
 from hudepth.errors import ConfigError, did_you_mean
 from hudepth.module import DepthModule
+from hudepth.tasks.devices import check_devices
 
 MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
 
@@ -18,7 +19,7 @@ def check_config(config: dict[str, Any]) -> None:
     """Check what no constructor checks in time, before anything is written.
 
     Raises:
-        ConfigError: for values out of range.
+        ConfigError: for values out of range, and devices that are not there.
     """
     if not isinstance(config["seed"], int):
         raise ConfigError(f"seed: {config['seed']!r} is not a whole number.")
@@ -38,6 +39,7 @@ def check_config(config: dict[str, Any]) -> None:
         raise ConfigError(
             f"callbacks.panels_every_n_epochs: {every!r} is less than 1. Pass callbacks.panels=0 for none."
         )
+    check_devices(config["trainer"])
 
 
 @torch.inference_mode()

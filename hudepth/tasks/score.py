@@ -27,6 +27,7 @@ from hudepth.metrics.summary import ImageTable, per_image_csv, summarise
 from hudepth.results import MODEL
 from hudepth.tasks.common import build_protocols, without_known_warnings
 from hudepth.tasks.config import whole_number
+from hudepth.tasks.devices import build_trainer, check_shares
 from hudepth.tasks.tables import print_results
 from hudepth.viz.panels import save_panels
 from hudepth.viz.strata import save_strata
@@ -62,6 +63,7 @@ def score_checkpoint(
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m, detailed=MODEL)
     with without_known_warnings():
         trainer = _trainer(config["trainer"])
+        check_shares(trainer, subset="test", pairs=len(datamodule.split.test))
         trainer.test(evaluation, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
         return {}
@@ -145,19 +147,16 @@ def _left_out(protocol: Protocol, table: ImageTable) -> list[str]:
 
 
 def _trainer(options: dict[str, Any]) -> Trainer:
-    try:
-        return Trainer(
-            **{"devices": 1, **options},
-            logger=False,
-            callbacks=[RichProgressBar()] if shows_progress() else None,
-            enable_checkpointing=False,
-            enable_model_summary=False,
-            enable_progress_bar=shows_progress(),
-            use_distributed_sampler=False,
-            inference_mode=True,
-        )
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"trainer: {error}") from error
+    return build_trainer(
+        {"devices": 1, **options},
+        logger=False,
+        callbacks=[RichProgressBar()] if shows_progress() else None,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        enable_progress_bar=shows_progress(),
+        use_distributed_sampler=False,
+        inference_mode=True,
+    )
 
 
 def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any]:

@@ -44,6 +44,7 @@ from hudepth.module import DepthModule
 from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, check_monitor
 from hudepth.tasks.common import build_data, build_protocols, without_known_warnings
 from hudepth.tasks.config import plain
+from hudepth.tasks.devices import build_trainer, check_shares
 from hudepth.tasks.pruning import TrialPruner
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.score import score_checkpoint
@@ -195,11 +196,13 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     callbacks = _callbacks(config, path, datamodule)
     with without_known_warnings():
         trainer = _trainer(config, path, callbacks)
+    check_shares(trainer, subset="validation", pairs=len(datamodule.split.val))
     log.info(
-        "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d, %s, %d threads",
+        "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d%s, %s, %d threads",
         type(module.net).__name__, f"{sum(p.numel() for p in module.net.parameters()):,}", datamodule.source.name,
         datamodule.split.kind, len(datamodule.split.train), len(datamodule.split.val), len(datamodule.split.test),
-        datamodule.batch_size, type(trainer.accelerator).__name__.removesuffix("Accelerator"),
+        datamodule.batch_size, f" in each of {trainer.world_size} processes" if trainer.world_size > 1 else "",
+        type(trainer.accelerator).__name__.removesuffix("Accelerator"),
         torch.get_num_threads(),
     )  # fmt: skip
     last = None
@@ -278,18 +281,15 @@ def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> T
     loggers: list[Logger] = [instantiate(extra, trust=config["trust"], only=Logger) for extra in options["extra"]]
     if options["tensorboard"]:
         loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
-    try:
-        return Trainer(
-            **config["trainer"],
-            logger=loggers or False,
-            callbacks=callbacks,
-            plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if _sweeping() else [])],
-            default_root_dir=path,
-            enable_model_summary=False,
-            enable_progress_bar=shows_progress() and not _sweeping(),
-            num_sanity_val_steps=0,
-            use_distributed_sampler=False,  # the data module shards by itself, exactly
-            log_every_n_steps=1,  # all is logged by epoch; a larger number only makes Lightning warn
-        )
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"trainer: {error}") from error
+    return build_trainer(
+        config["trainer"],
+        logger=loggers or False,
+        callbacks=callbacks,
+        plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if _sweeping() else [])],
+        default_root_dir=path,
+        enable_model_summary=False,
+        enable_progress_bar=shows_progress() and not _sweeping(),
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,  # the data module shards by itself, exactly
+        log_every_n_steps=1,  # all is logged by epoch; a larger number only makes Lightning warn
+    )
