@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
@@ -60,3 +62,15 @@ def write_json(path: Path, value: Any) -> None:
         ValueError: if it holds NaN or infinity, which JSON has no word for.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def read_yaml(path: Path) -> Any:
+    """Read plain YAML, with the fast parser where PyYAML was built with it.
+
+    Raises:
+        OSError: whatever the file system says.
+        UnicodeDecodeError: if it is no text.
+        yaml.YAMLError: if it is no YAML.
+    """
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    return yaml.load(path.read_text(encoding="utf-8"), Loader=loader)

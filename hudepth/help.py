@@ -8,7 +8,7 @@ ABOUT = {
     "train": "Train a monocular depth model and test its best checkpoint. All goes to runs/<name>/<date_time>/.",
     "test": "Score a checkpoint. It needs nothing but the checkpoint: model, data and split are recorded in it.",
     "data": "Prepare a data set once as a depth store, show what is known of it, or audit it for leaks and units.",
-    "report": "Compare two runs, put several or a whole sweep in one table, draw a run's figures, or check the paper's claims.",
+    "report": "Compare two runs, put several or a whole sweep in one table, draw figures, or check the paper's claims.",
 }
 
 USAGE = {

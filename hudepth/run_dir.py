@@ -31,7 +31,7 @@ from filelock import FileLock, Timeout
 
 from hudepth.console import log
 from hudepth.errors import CheckpointError, ConfigError
-from hudepth.files import write_json, write_text
+from hudepth.files import read_yaml, write_json, write_text
 
 CHECKPOINTS = "checkpoints"
 BEST, LAST = "best.ckpt", "last.ckpt"
@@ -100,7 +100,7 @@ def read_config(path: Path) -> dict[str, Any]:
         CheckpointError: if there is none or it is damaged.
     """
     try:
-        config = yaml.safe_load((path / "config.yaml").read_text(encoding="utf-8"))
+        config = read_yaml(path / "config.yaml")
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         why = " ".join(str(error).split())
         raise CheckpointError(f"'{path}' is no run directory: its config.yaml cannot be read ({why}).") from error

@@ -23,7 +23,7 @@ import yaml
 
 from hudepth import run_dir
 from hudepth.errors import DataError, HudepthError, did_you_mean
-from hudepth.files import write_text
+from hudepth.files import read_yaml, write_text
 from hudepth.results import flat
 
 SWEEP_FILE = "sweep.yaml"
@@ -180,7 +180,7 @@ def read_jobs(folder: Path) -> Jobs:
     if not path.is_file():
         return {}
     try:
-        sweeps = yaml.safe_load(path.read_text(encoding="utf-8"))["sweeps"]
+        sweeps = read_yaml(path)["sweeps"]
         return {
             str(name): [{"labels": {str(k): str(v) for k, v in job["labels"].items()}, **_outcome(job)} for job in each]
             for name, each in sweeps.items()

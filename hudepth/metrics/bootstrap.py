@@ -37,6 +37,8 @@ REPEATS = 2000
 SEED = 0
 MOST_COUNTS = 1_000_000
 """Draws are counted so many scenes at a time, so that thousands of scenes need no more memory than hundreds."""
+MOST_PRODUCTS = 200_000
+"""So many multiplications at a time: in larger products BLAS starts threads, which cost more than they bring."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +101,10 @@ class Resampler:
         drawn = np.zeros((self.repeats, len(flat)))
         start = 0
         for counts in self._kept if self._kept is not None else self._drawn():
-            with np.errstate(invalid="ignore"):  # 0 times infinity
-                drawn[start : start + len(counts)] = counts @ per_scene
-            start += len(counts)
+            for part in np.array_split(counts, math.ceil(len(counts) * per_scene.size / MOST_PRODUCTS)):
+                with np.errstate(invalid="ignore"):  # 0 times infinity
+                    drawn[start : start + len(part)] = part @ per_scene
+                start += len(part)
         sums = dict(zip(columns, drawn.reshape(self.repeats, -1, 2).transpose(1, 2, 0), strict=True))
         metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
         defined = dict(zip(columns, np.count_nonzero(per_scene[:, 1::2], axis=0).tolist(), strict=True))

@@ -57,14 +57,18 @@ def _panel(axis: Axes, rows: Sequence[Row], name: str) -> None:
     axis.axvline(0, color="0.3", linewidth=0.9)
     low, high = _limits([each for _, each in found])
     axis.set_xlim(low, high)
-    for place, each in found:
-        colour = COLOURS[each.verdict]
-        _bar(axis, each.scenes, place - OFFSET / 2, colour, linewidth=5, alpha=0.35, solid_capstyle="butt")
-        _bar(axis, each.seeds, place + OFFSET, colour, linewidth=1.2)
-        if low <= each.value <= high:
-            axis.plot(each.value, place - OFFSET / 2, "o", color=colour, markersize=4.5, zorder=4)
-        else:
-            _beyond(axis, each.value, place, colour)
+    _bars(axis, [(place - OFFSET / 2, each.scenes, COLOURS[each.verdict]) for place, each in found], thick=True)
+    _bars(axis, [(place + OFFSET, each.seeds, COLOURS[each.verdict]) for place, each in found], thick=False)
+    dots = [(each.value, place - OFFSET / 2, COLOURS[each.verdict]) for place, each in found]
+    inside = [dot for dot in dots if low <= dot[0] <= high]
+    axis.scatter([x for x, _, _ in inside], [y for _, y, _ in inside], s=22, c=[c for _, _, c in inside], zorder=4)
+    for value, place, colour in dots:
+        if value < low or value > high:
+            _beyond(axis, value, place, colour)
+    _finish(axis, name)
+
+
+def _finish(axis: Axes, name: str) -> None:
     unit = f" [{UNITS[name]}]" if name in UNITS else ""
     axis.set_title(name + unit, fontsize=10)
     axis.set_xlabel("better →" if higher_is_better(name) else "← better", fontsize=9)
@@ -77,30 +81,30 @@ def _panel(axis: Axes, rows: Sequence[Row], name: str) -> None:
         axis.spines[side].set_visible(False)
 
 
-def _bar(axis: Axes, interval: Interval, place: float, colour: str, **style: Any) -> None:
-    """Draw an interval; where it leaves the plot, an arrow says so."""
-    if not interval.known:
-        return
+def _bars(axis: Axes, bars: Sequence[tuple[float, Interval, str]], *, thick: bool) -> None:
+    """Draw intervals, all at once; where a thin one leaves the plot, an arrow says so."""
     left, right = axis.get_xlim()
-    if interval.high < left or interval.low > right:
+    seen = [bar for bar in bars if bar[1].known and bar[1].high >= left and bar[1].low <= right]
+    places, colours = [place for place, _, _ in seen], [colour for _, _, colour in seen]
+    lows, highs = [max(each.low, left) for _, each, _ in seen], [min(each.high, right) for _, each, _ in seen]
+    style: dict[str, Any] = {"linewidth": 5, "alpha": 0.35} if thick else {"linewidth": 1.2}
+    axis.hlines(places, lows, highs, colors=colours, **style)
+    if thick:
         return
-    ends = [min(max(end, left), right) for end in (interval.low, interval.high)]
-    axis.plot(ends, [place, place], color=colour, **style)
-    if style["linewidth"] < 2:  # the thin one: caps, or arrows
-        marks = ("<" if interval.low < left else "|", ">" if interval.high > right else "|")
-        for end, mark in zip(ends, marks, strict=True):
-            axis.plot(end, place, mark, color=colour, markersize=5, clip_on=False)
+    ends = [(x, y, "<" if each.low < left else "|", c) for x, (y, each, c) in zip(lows, seen, strict=True)]
+    ends += [(x, y, ">" if each.high > right else "|", c) for x, (y, each, c) in zip(highs, seen, strict=True)]
+    for mark in "|<>":
+        points = [(x, y, colour) for x, y, kind, colour in ends if kind == mark]
+        xs, ys, inks = ([point[i] for point in points] for i in range(3))
+        axis.scatter(xs, ys, s=26, c=inks, marker=mark, linewidths=1.2, clip_on=False)
 
 
 def _beyond(axis: Axes, value: float, place: float, colour: str) -> None:
     """Write down a difference that lies outside the plot."""
     left, right = axis.get_xlim()
-    on_right = value > right
-    text = f"{value:+.3f} →" if on_right else f"← {value:+.3f}"
-    axis.text(
-        right if on_right else left, place - OFFSET / 2, text, ha="right" if on_right else "left", va="center",
-        fontsize=8, color=colour, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8}, zorder=5,
-    )  # fmt: skip
+    text, x, side = (f"{value:+.3f} →", right, "right") if value > right else (f"← {value:+.3f}", left, "left")
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
+    axis.text(x, place, text, ha=side, va="center", fontsize=8, color=colour, bbox=box, zorder=5)
 
 
 def _limits(found: Sequence[Contrast]) -> tuple[float, float]:
