@@ -80,7 +80,7 @@ def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPat
         GlobalHydra.instance().clear()
         monkeypatch.setattr(sys, "argv", words)
         assert getattr(cli, words[0].removeprefix("hudepth-"))() == 0, command
-    jobs = list(folder.glob("sweeps/badcl/*/*/status.json"))
+    jobs = list(folder.glob("terms/*/status.json"))
     assert len(jobs) == 9
     assert all(json.loads(job.read_text())["state"] == "finished" for job in jobs)
 
@@ -118,11 +118,11 @@ def test_what_a_random_split_is_worth_is_what_the_study_found() -> None:
     assert said.groups() == tuple(f"{same[side][0]:.3f}" for side in ("random", "disjoint"))
 
 
-@pytest.mark.parametrize("group", ["data", "protocol"])
+@pytest.mark.parametrize("group", ["data", "protocol", "+sweep"])
 def test_a_table_lists_every_choice(group: str) -> None:
-    (table,) = re.findall(rf"^\| `{group}=` \|.*\n\|---\|---\|\n((?:\|.*\n)+)", README, re.MULTILINE)
+    (table,) = re.findall(rf"^\| `{re.escape(group)}=` \|.*\n\|---\|---\|\n((?:\|.*\n)+)", README, re.MULTILINE)
     listed = set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
-    assert listed == {path.stem for path in (ROOT / "conf" / group).glob("*.yaml")} - {"base"}
+    assert listed == {path.stem for path in (ROOT / "conf" / group.lstrip("+")).glob("*.yaml")} - {"base"}
 
 
 def test_make_help_lists_every_target() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,10 +26,8 @@ STUDY_FILE = "study.log"
 STUDY = "hudepth"
 TRIAL_ENV = "HUDEPTH_TRIAL"
 """``<number>:<study file>``, in the environment of a job that is a trial."""
-OPTIONS: dict[str, Any] = {
-    "trials": 30, "sampler": "tpe", "seed": 0, "startup_trials": 8, "prune": True, "warmup_epochs": 2,
-}  # fmt: skip
-"""Keys of ``hydra.sweeper.search`` and their defaults."""
+OPTIONS = ("trials", "sampler", "seed", "startup_trials", "prune", "warmup_epochs")
+"""Keys of ``hydra.sweeper.search``; conf/hydra/sweeper/hudepth.yaml says what they are."""
 
 
 def search(
@@ -46,7 +45,7 @@ def search(
     Raises:
         ConfigError: if optuna is not installed, an option is unknown, nothing is searched over, or all trials failed.
     """
-    chosen = check_options(options)
+    check_options(options)
     mine = {override.key_or_group for override in typed}
     every = [*(override for override in params if override.key_or_group not in mine), *typed]
     constants = [str(override.input_line) for override in every if not override.is_sweep_override()]
@@ -54,10 +53,10 @@ def search(
     if not space:
         raise ConfigError("search: nothing to search over. Give a key a range, as in 'loss.boundary=interval(0.3,30)'.")
     direction = "minimize" if sweep.master.mode == "min" else "maximize"
-    study = open_study(str(folder / STUDY_FILE), chosen, direction=direction)
+    study = open_study(str(folder / STUDY_FILE), options, direction=direction)
     at_once = max(1, int(sweep.master.hydra.launcher.get("n_jobs") or 1))
     jobs: list[Job] = []
-    while trials := _next_trials(study, space, at_once, int(chosen["trials"])):
+    while trials := _next_trials(study, space, at_once, int(options["trials"])):
         batch = [_job(trial, constants, folder) for trial in trials]
         batch = find_done(sweep.compose(batch), folder)
         if all(job.config is None for job in batch) and not jobs:
@@ -71,8 +70,8 @@ def search(
     _say_best(study, folder, monitor=str(sweep.master.monitor))
 
 
-def check_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all options of a search.
+def check_options(options: Mapping[str, Any]) -> None:
+    """Check the options of a search.
 
     Raises:
         ConfigError: for an unknown key or a value out of range.
@@ -82,12 +81,10 @@ def check_options(options: Mapping[str, Any]) -> dict[str, Any]:
             raise ConfigError(
                 f"hydra.sweeper.search: no '{key}'.{did_you_mean(key, OPTIONS)} It takes {', '.join(OPTIONS)}."
             )
-    chosen = {**OPTIONS, **options}
     for key, least in (("trials", 1), ("seed", 0), ("startup_trials", 0), ("warmup_epochs", 0)):
-        whole_number(chosen, key, default=OPTIONS[key], least=least)
-    if chosen["sampler"] not in ("tpe", "random"):
-        raise ConfigError(f"hydra.sweeper.search.sampler: no '{chosen['sampler']}'. Pass tpe or random.")
-    return chosen
+        whole_number(options, key, default=least, least=least)
+    if options["sampler"] not in ("tpe", "random"):
+        raise ConfigError(f"hydra.sweeper.search.sampler: no '{options['sampler']}'. Pass tpe or random.")
 
 
 def distribution(override: Override) -> Any:
@@ -104,11 +101,12 @@ def distribution(override: Override) -> Any:
             low, high = float(value.start or 0), float(value.end or 0)
             return optuna_.distributions.FloatDistribution(low, high, log=log)
         if isinstance(value, RangeSweep):
-            start, stop, step = value.start or 0, value.stop or 0, value.step
+            start, stop, step = value.start or 0, value.stop or 0, value.step  # which, like Python's, ends before stop
             if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
-                last = stop - 1 - (stop - 1 - start) % step  # Hydra's ranges, like Python's, end before stop
+                last = stop - 1 - (stop - 1 - start) % step
                 return optuna_.distributions.IntDistribution(start, last, step=1 if log else step, log=log)
-            return optuna_.distributions.FloatDistribution(float(start), float(stop), step=float(step))
+            steps = math.ceil((stop - start) / step) - 1
+            return optuna_.distributions.FloatDistribution(float(start), start + steps * step, step=float(step))
         if isinstance(value, ChoiceSweep):
             return optuna_.distributions.CategoricalDistribution(list(override.sweep_string_iterator()))
     except ValueError as error:
@@ -116,8 +114,15 @@ def distribution(override: Override) -> Any:
     raise ConfigError(f"'{override.input_line}': pass interval(low,high), range(first,end,step) or choice(a,b).")
 
 
-def open_study(file: str, options: Mapping[str, Any] = OPTIONS, *, direction: str = "minimize") -> optuna.study.Study:
+def open_study(
+    file: str, options: Mapping[str, Any] | None = None, *, direction: str = "minimize"
+) -> optuna.study.Study:
     """Open the study in a file that many processes may write to and a kill cannot damage; make it if there is none.
+
+    Args:
+        file: its path.
+        options: of the search, which are kept in the study; None: those that are.
+        direction: ``minimize`` or ``maximize``.
 
     Raises:
         ConfigError: if optuna is not installed, or the file is none of its own.
@@ -127,24 +132,26 @@ def open_study(file: str, options: Mapping[str, Any] = OPTIONS, *, direction: st
     from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
     logging.getLogger("optuna").setLevel(logging.WARNING)
-    pruner: optuna.pruners.BasePruner = optuna_.pruners.NopPruner()
-    if options["prune"]:
-        pruner = optuna_.pruners.MedianPruner(options["startup_trials"], options["warmup_epochs"])
     try:
         storage = JournalStorage(JournalFileBackend(file, lock_obj=JournalFileOpenLock(file)))
         study: optuna.study.Study = optuna_.create_study(
-            storage=storage, study_name=STUDY, load_if_exists=True, direction=direction, pruner=pruner
+            storage=storage, study_name=STUDY, load_if_exists=True, direction=direction
         )
+        if options is not None:
+            study.set_user_attr("options", dict(options))
+        chosen = study.user_attrs["options"]
         # another seed for each trial: a study that goes on should not draw again what it drew at first
-        seed = int(options["seed"]) + len(study.get_trials(deepcopy=False))
+        seed = int(chosen["seed"]) + len(study.get_trials(deepcopy=False))
     except Exception as error:
         why = " ".join(str(error).split())
         raise ConfigError(f"search: '{file}' is no study that can go on ({why}). Pass another sweep_dir.") from error
-    samplers = optuna_.samplers
+    pruners, samplers = optuna_.pruners, optuna_.samplers
+    startup, warmup = chosen["startup_trials"], chosen["warmup_epochs"]
+    study.pruner = pruners.MedianPruner(startup, warmup) if chosen["prune"] else pruners.NopPruner()
     study.sampler = (
         samplers.RandomSampler(seed=seed)
-        if options["sampler"] == "random"
-        else samplers.TPESampler(seed=seed, n_startup_trials=options["startup_trials"], constant_liar=True)
+        if chosen["sampler"] == "random"
+        else samplers.TPESampler(seed=seed, n_startup_trials=startup, constant_liar=True)
     )
     return study
 

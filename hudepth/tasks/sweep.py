@@ -40,7 +40,7 @@ class Sweep(Sweeper):
     Args:
         params: key: comma-separated values.
         variants: name: overrides.
-        search: how to search instead of trying all, see :mod:`hudepth.tasks.search`; None: try all.
+        search: how to search instead of trying all, if it has ``trials``; see :mod:`hudepth.tasks.search`.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Sweep(Sweeper):
         search: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.params, self.search = dict(params or {}), search
+        self.params, self.search = dict(params or {}), plain_options(search or {})
         self.variants = {
             str(name): [str(each) for each in overrides or ()] for name, overrides in (variants or {}).items()
         }
@@ -73,11 +73,11 @@ class Sweep(Sweeper):
         parser = OverridesParser.create(config_loader=self.context.config_loader)
         typed = parser.parse_overrides(list(arguments))
         params = parser.parse_overrides([f"{key}={value}" for key, value in self.params.items()])
-        if self.search:
+        if self.search.get("trials") is not None:
             from hudepth.tasks.search import search
 
             with _held(folder):
-                search(self, folder, typed=typed, params=params, options=plain_options(self.search))
+                search(self, folder, typed=typed, params=params, options=self.search)
             return
         jobs = self.compose(combine(typed, params, self.variants))
         if all(job.config is None for job in jobs):

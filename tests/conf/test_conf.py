@@ -8,9 +8,12 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from hudepth import cli
+from hudepth.tasks.sweep_jobs import Job, combine
+from hudepth.tasks.sweep_jobs import compose as compose_jobs
 
 CONF = cli.conf_folder()
 FILES = sorted(CONF.rglob("*.yaml"))
@@ -71,14 +74,69 @@ def test_every_model_trains_a_step_and_is_tested(
     assert list(tmp_path.glob("runs/*/*/test/eigen/metrics.json"))
 
 
+def jobs_of(name: str, *typed: str) -> list[Job]:
+    """The jobs of a sweep's file, composed."""
+    sweeper = yaml.safe_load((CONF / "sweep" / f"{name}.yaml").read_text())["hydra"]["sweeper"]
+    parser = OverridesParser.create()
+    params = parser.parse_overrides([f"{key}={values}" for key, values in sweeper.get("params", {}).items()])
+    jobs = combine(parser.parse_overrides(list(typed)), params, sweeper.get("variants", {}))
+    return compose_jobs(jobs, lambda overrides: composed(*overrides), str)
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("loss_terms", 33),
+        ("badcl_reading", 21),
+        ("attention", 18),
+        ("architecture", 9),
+        ("seeds", 5),
+        ("lambda_grid", 27),
+    ],
+)
+def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> None:
+    jobs = jobs_of(name)
+    assert [job.error for job in jobs] == [""] * count
+    assert len({job.folder for job in jobs}) == count
+    text = (CONF / "sweep" / f"{name}.yaml").read_text()
+    assert f"{count} runs" in text
+
+
+def test_the_subsets_of_badcls_terms_are_all_seven() -> None:
+    weights = [job.config["loss"] for job in jobs_of("loss_terms", "seed=1") if job.config]
+    subsets = {
+        tuple(bool(loss[term]) for term in ("boundary", "smoothness", "scaling"))
+        for loss in weights
+        if "boundary" in loss
+    }
+    assert len(subsets) == 7
+    assert len(weights) == 7 + 4
+
+
+def test_a_reading_of_badcl_changes_one_choice_at_a_time() -> None:
+    losses = [job.config["loss"] for job in jobs_of("badcl_reading", "seed=1") if job.config]
+    paper = losses[0]
+    assert [sum(loss[key] != paper[key] for key in paper) for loss in losses] == [0, 1, 1, 1, 1, 1, 1]
+
+
 @pytest.mark.parametrize("name", names("sweep"))
-def test_every_sweep_is_a_multirun_whose_jobs_compose(name: str) -> None:
-    text = yaml.safe_load((CONF / "sweep" / f"{name}.yaml").read_text())
-    params = text["hydra"]["sweeper"]["params"]
-    assert text["hydra"]["mode"] == "MULTIRUN"
-    for key, values in params.items():
-        for value in str(values).split(","):
-            assert composed(f"{key}={value}")
+def test_every_sweep_runs(
+    name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = {
+        "attention": ["seed=1"], "architecture": ["seed=1", "data.size=[64,64]"], "seeds": ["seed=1,2", "model=tiny"],
+        "lambda_grid": ["loss.boundary=3.0", "loss.smoothness=0.6,1.2", "loss.scaling=1", "model=tiny"],
+        "lambda_search": ["hydra.sweeper.search.trials=2", "model=tiny"],
+    }.get(name, ["seed=1", "model=tiny"])  # fmt: skip
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HUDEPTH_CACHE", str(tmp_path_factory.getbasetemp() / "conf_cache"))
+    steps = ["trainer.limit_train_batches=1", "trainer.limit_val_batches=1", "test=false", "logger=none"]
+    monkeypatch.setattr(sys, "argv", ["hudepth-train", f"+sweep={name}", *SMALL, *steps, *more])
+    assert cli.train() == 0
+    states = [yaml.safe_load(file.read_text())["state"] for file in tmp_path.glob("sweeps/*/*/*/status.json")]
+    assert len(states) >= 2
+    assert set(states) == {"finished"}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))

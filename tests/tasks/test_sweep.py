@@ -94,7 +94,7 @@ def test_a_failing_job_stops_no_other_and_is_tried_again(command: Command, tmp_p
     found = runs(tmp_path / "s")
     assert status(found["-1"])["error"] == "torch.optim.AdamW: Invalid learning rate: -1"
     assert (found["-1"] / "train.log").read_text().count("Traceback (most recent call last)") == 2
-    assert status(found["1e-3"])["state"] == "finished"
+    assert status(found["0.001"])["state"] == "finished"
     again = sweep(command, "optim.lr=-1,1e-3")
     assert again.code == 1
     assert "sweep tried: 1 of 2 jobs to run, 1 finished before" in again.err
