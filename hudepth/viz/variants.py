@@ -58,7 +58,8 @@ def band(runs: Sequence[History], key: str) -> Band:
     """Return mean, lowest and highest of several seeds at the epochs that all of them have."""
     columns = [{row["epoch"]: row[key] for row in run if key in row} for run in runs]
     epochs = sorted(set.intersection(*(set(column) for column in columns))) if columns else []
-    values = np.array([[column[epoch] for epoch in epochs] for column in columns]).reshape(len(columns), len(epochs))
+    table = [[column[epoch] for epoch in epochs] for column in columns]
+    values = np.array(table, dtype=np.float64).reshape(len(columns), len(epochs))
     x = np.array(epochs, dtype=np.float64)
     return (x, values.mean(axis=0), values.min(axis=0), values.max(axis=0)) if len(columns) else (x, x, x, x)
 
