@@ -116,7 +116,7 @@ def _run_hydra(task: str) -> int:
     errors: list[Exception] = []
 
     def job(cfg: Any) -> Any:  # pickled by launchers that run jobs in other processes
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
+        if task == "train" and HydraConfig.get().mode == RunMode.MULTIRUN:
             return importlib.import_module("hudepth.tasks.job").run_job(cfg)
         from hudepth.console import setup_logging
 
@@ -129,8 +129,10 @@ def _run_hydra(task: str) -> int:
             return None
 
     hydra.main(config_path="pkg://hudepth.conf", config_name=task, version_base="1.3")(job)()
+    for error in errors[:-1]:
+        print(f"hudepth-{task}: {one_line(error, task)}", file=sys.stderr)
     if errors:
-        raise errors[0]
+        raise errors[-1]
     return 0
 
 

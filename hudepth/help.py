@@ -24,6 +24,7 @@ EXAMPLES = {
         ("hudepth-train +experiment=badcl data=nyu_labeled data.root=nyu", "the paper's recipe on real NYU depth"),
         ("hudepth-train loss=silog optim.lr=3e-4 trainer.max_epochs=10", "other parts, other values"),
         ("hudepth-train -m loss=badcl,l1,silog seed=1,2,3", "every combination, one run each"),
+        ("hudepth-train +sweep=loss_terms seed=1,2 sweep_dir=terms", "an ablation; typed again, it goes on"),
         ("hudepth-train resume=runs/badcl/2025-08-11_12-00-00", "go on after an interruption"),
     ),
     "test": (
@@ -79,5 +80,5 @@ def _groups(task: str) -> list[str]:
     """Return the groups a task's configuration is made of, plus those that can be added."""
     text = (conf_folder() / f"{task}.yaml").read_text(encoding="utf-8")
     named = [line.split("-", 1)[1].split(":")[0].strip() for line in text.splitlines() if line.startswith("  - ")]
-    groups = [name for name in named if name not in ("_self_", "hydra", "paths")]
+    groups = [name for name in named if name not in ("_self_", "hydra", "paths") and " " not in name]
     return [*groups, "experiment", "sweep"] if task == "train" else groups

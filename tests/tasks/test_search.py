@@ -120,7 +120,7 @@ def test_a_search_ends_with_its_best_trials_and_can_be_given_more(command: Comma
     assert done.code == 0, done.err
     assert re.search(r"^search: \d trials finished, \d pruned, 0 failed; in ", done.err, re.MULTILINE)
     assert re.search(
-        r"^  1\. val/abs_rel 0\.\d{4}: loss\.boundary=[\d.]+ optim\.lr=1e-\d+ \(trial \d\)$", done.err, re.MULTILINE
+        r"^  1\. val/abs_rel 0\.\d{4}: loss\.boundary=[\d.]+ optim\.lr=[\de.-]+ \(trial \d\)$", done.err, re.MULTILINE
     )
     first = trials(tmp_path / "s")
     assert len(first) == 4

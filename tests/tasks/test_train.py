@@ -43,7 +43,7 @@ def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
         "test/eigen/strata.csv", "test/eigen/strata.png",
     }  # fmt: skip
     assert expected <= files
-    assert {name.split("/")[0] for name in files - expected} == {"tensorboard"}
+    assert {name.split("/")[0] for name in files - expected} == {"tensorboard", ".lock"}
     assert status(trained)["state"] == "finished"
     assert (trained / "overrides.txt").read_text().splitlines() == [*TINY, "name=tiny"]
     config = yaml.safe_load((trained / "config.yaml").read_text())
