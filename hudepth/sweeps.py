@@ -28,7 +28,8 @@ from hudepth.results import flat
 
 SWEEP_FILE = "sweep.yaml"
 INCIDENTAL = (
-    "name", "resume", "trust", "test", "baselines", "protocol", "sweep_dir", "variant", "paths", "logger", "hydra", "debug",
+    "name", "resume", "trust", "test", "baselines", "protocol", "sweep_dir", "variant", "paths", "logger",
+    "hydra", "debug",
     "callbacks.panels", "callbacks.panels_every_n_epochs",
     "data.root", "data.cache", "data.num_workers", "data.prepare_workers",
     "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy",
