@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -133,6 +134,9 @@ def open_study(
 
     logging.getLogger("optuna").setLevel(logging.WARNING)
     try:
+        if Path(file).is_file():  # optuna would add to any file
+            with Path(file).open(encoding="utf-8") as lines:
+                json.loads(next(lines, "{}"))
         storage = JournalStorage(JournalFileBackend(file, lock_obj=JournalFileOpenLock(file)))
         study: optuna.study.Study = optuna_.create_study(
             storage=storage, study_name=STUDY, load_if_exists=True, direction=direction

@@ -157,7 +157,7 @@ def _run(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     except (KeyboardInterrupt, SystemExit):
         _status(path, "interrupted")
         log.info("interrupted; continue with: hudepth-train resume=%s", path)
-        raise
+        raise KeyboardInterrupt from None  # which Lightning turns into the exit code of an error
     except BaseException as error:
         _failed(path, f"{type(error).__name__}: {error}")
         raise
