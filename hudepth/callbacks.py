@@ -21,7 +21,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import nn
 
 from hudepth import run_dir
-from hudepth.console import console, duration, log
+from hudepth.console import duration, log
 from hudepth.data.datamodule import preprocess
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.store import DepthStore
@@ -263,8 +263,3 @@ def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelChe
         folder, filename=Path(run_dir.LAST).stem, save_on_train_epoch_end=True, enable_version_counter=False
     )
     return [best, last]
-
-
-def shows_progress() -> bool:
-    """Whether a live progress bar makes sense here."""
-    return console.is_terminal

@@ -18,6 +18,9 @@ console = Console(stderr=True)
 
 log = logging.getLogger("hudepth")
 
+_shown = {"level": logging.INFO}
+"""From which level on log lines reach the terminal."""
+
 
 class _CurrentStderr(logging.Handler):
     """Writes to what is standard error when a line comes: a progress bar puts its own in place, to stay below lines."""
@@ -37,7 +40,13 @@ def setup_logging(level: int = logging.INFO, *, prefix: str = "") -> None:
     handler.setFormatter(logging.Formatter(f"{prefix.replace('%', '%%')}%(message)s"))
     log.handlers[:] = [handler]
     log.setLevel(logging.INFO)
+    _shown["level"] = level
     log.propagate = False
+
+
+def shows_progress() -> bool:
+    """Whether a live progress bar makes sense here: in a terminal, and not in a job of a sweep, which is silent."""
+    return console.is_terminal and _shown["level"] <= logging.INFO
 
 
 def track(items: Iterable[T], *, total: int, what: str) -> Iterator[T]:
@@ -48,7 +57,7 @@ def track(items: Iterable[T], *, total: int, what: str) -> Iterator[T]:
         total: how many there are.
         what: shown before the bar, for example ``preparing nyu_labeled``.
     """
-    if console.is_terminal:
+    if shows_progress():
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console, transient=True) as progress:
             yield from progress.track(items, total=total, description=what)

@@ -172,6 +172,8 @@ def state(path: Path) -> tuple[str, str]:
     if found not in STATES:
         return "interrupted", ""
     if found == "running":
+        if not (path / LOCK).exists():  # nobody ever held it; a look should leave nothing behind
+            return "interrupted", ""
         try:
             with held(path):
                 return "interrupted", ""

@@ -4,7 +4,8 @@ Runs the same eight small trainings on rooms twice in turns, each time with fres
 process (the basic launcher), and side by side (joblib, as many processes as there are cores).
 
 Cost of a job: from the start of the first job to the end of the last, less the time in which a job was at work (from
-the first line of its train.log to its last status), a job. Then a report is made of them.
+the first line of its train.log to its last status). Then a report is made of them, without and with pictures of
+predictions, for which torch is imported and networks are loaded: that costs the same for few jobs as for many.
 
     python experiments/speed/sweep_cost.py [--pairs 2] [--epochs 60]
 """
@@ -70,19 +71,20 @@ def main() -> None:
             two = timed([*command(options.epochs), f"sweep_dir=two{pair}", "hydra/launcher=joblib"], cwd)
             at_work = spans(cwd / f"one{pair}")
             between = (at_work[-1][1] - at_work[0][0] - sum(end - start for start, end in at_work)) / (JOBS - 1)
-            report = timed(["hudepth-report", "sweep", f"dir=one{pair}", "protocol=paper"], cwd)
+            words = ["hudepth-report", "sweep", f"dir=one{pair}", "protocol=paper"]
+            report, pictures = timed([*words, "panels=0"], cwd), timed(words, cwd)
             ratios.append(one / two)
             costs.append(between)
             reports.append(report)
             print(
                 f"pair {pair + 1}: one after the other {one:.1f} s, side by side {two:.1f} s, ratio {one / two:.2f}; "
-                f"between two jobs {between:.2f} s; report {report:.1f} s, {report / JOBS:.2f} s a job",
+                f"between two jobs {between:.2f} s; report {report:.1f} s, with predictions drawn {pictures:.1f} s",
                 flush=True,
             )
     print(f"{JOBS} jobs of {options.epochs} epochs on {len(os.sched_getaffinity(0))} cores")
     print(f"side by side: {statistics.median(ratios):.2f} times as fast")
     print(f"launching: {statistics.median(costs):.2f} s a job")
-    print(f"collecting: {statistics.median(reports) / JOBS:.2f} s a job")
+    print(f"collecting, without drawing predictions anew: {statistics.median(reports) / JOBS:.2f} s a job")
 
 
 if __name__ == "__main__":

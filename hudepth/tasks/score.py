@@ -12,9 +12,9 @@ from lightning.pytorch.callbacks import RichProgressBar
 from torch import nn
 
 from hudepth.baselines import trivial_baselines
-from hudepth.callbacks import evenly_spaced, make_panels, shows_progress
+from hudepth.callbacks import evenly_spaced, make_panels
 from hudepth.checkpoint import Checkpoint
-from hudepth.console import log
+from hudepth.console import log, shows_progress
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.errors import ConfigError
 from hudepth.evaluation import Evaluation

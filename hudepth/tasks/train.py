@@ -14,10 +14,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.fabric.plugins.environments.lightning import LightningEnvironment
-from lightning.pytorch import Callback, Trainer, seed_everything
-from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch import seed_everything
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 from torch import nn
@@ -25,16 +22,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth import run_dir
-from hudepth.callbacks import (
-    EpochLine,
-    History,
-    Interrupt,
-    PanelPictures,
-    checkpoint_callbacks,
-    evenly_spaced,
-    shows_progress,
-)
-from hudepth.checkpoint import AtomicCheckpointIO, load_checkpoint
+from hudepth.checkpoint import load_checkpoint
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
@@ -44,11 +32,10 @@ from hudepth.module import DepthModule
 from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, check_monitor
 from hudepth.tasks.common import build_data, build_protocols, without_known_warnings
 from hudepth.tasks.config import plain
-from hudepth.tasks.devices import build_trainer, check_shares
-from hudepth.tasks.pruning import TrialPruner
+from hudepth.tasks.devices import check_shares
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.score import score_checkpoint
-from hudepth.tasks.search import TRIAL_ENV
+from hudepth.tasks.trainer import build_callbacks, build_run_trainer
 
 RUN_ENV = "HUDEPTH_RUN"
 """Tells the processes of a distributed run which run directory the first one made."""
@@ -193,9 +180,9 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
         save_split(split_file, datamodule.split, datamodule.store.records)
     module = build_module(config, net, datamodule, trust=trust)
     check_monitor(config["monitor"], module)
-    callbacks = _callbacks(config, path, datamodule)
+    callbacks = build_callbacks(config, path, datamodule)
     with without_known_warnings():
-        trainer = _trainer(config, path, callbacks)
+        trainer = build_run_trainer(config, path, callbacks, alone=_sweeping())
     check_shares(trainer, subset="validation", pairs=len(datamodule.split.val))
     log.info(
         "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d%s, %s, %d threads",
@@ -244,52 +231,4 @@ def build_module(
             "split": datamodule.split.summary(),
             "data": {key: datamodule.store.info[key] for key in ("source", "fingerprint", "encoding", "pairs")},
         },
-    )
-
-
-def _callbacks(config: dict[str, Any], path: Path, datamodule: DepthDataModule) -> list[Callback]:
-    options = config["callbacks"]
-    monitor, mode = config["monitor"], config["mode"]
-    callbacks: list[Callback] = [Interrupt(), History(path / "metrics.csv"), EpochLine(monitor)]
-    if options["panels"]:
-        callbacks.append(
-            PanelPictures(
-                path / "images",
-                datamodule.store,
-                evenly_spaced(sorted(datamodule.split.val), options["panels"]),
-                every_n_epochs=options["panels_every_n_epochs"],
-                max_depth_m=datamodule.max_depth_m,
-            )
-        )
-    if shows_progress() and not _sweeping():
-        callbacks.append(RichProgressBar(leave=False))
-    if trial := os.environ.get(TRIAL_ENV):
-        callbacks.append(TrialPruner(trial, monitor=monitor))
-    if options["early_stopping"]:
-        callbacks.append(EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"]))
-    callbacks += [instantiate(extra, trust=config["trust"], only=Callback) for extra in options["extra"]]
-    return [*callbacks, *checkpoint_callbacks(path, monitor=monitor, mode=mode)]
-
-
-def _trainer(config: dict[str, Any], path: Path, callbacks: list[Callback]) -> Trainer:
-    if str(config["trainer"].get("precision", "")).endswith("16-true"):
-        raise ConfigError(
-            f"trainer.precision: {config['trainer']['precision']} keeps the weights in 16 bits, which loses updates. "
-            "Pass bf16-mixed, 16-mixed or 32-true."
-        )
-    options = config["logger"]
-    loggers: list[Logger] = [instantiate(extra, trust=config["trust"], only=Logger) for extra in options["extra"]]
-    if options["tensorboard"]:
-        loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
-    return build_trainer(
-        config["trainer"],
-        logger=loggers or False,
-        callbacks=callbacks,
-        plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if _sweeping() else [])],
-        default_root_dir=path,
-        enable_model_summary=False,
-        enable_progress_bar=shows_progress() and not _sweeping(),
-        num_sanity_val_steps=0,
-        use_distributed_sampler=False,  # the data module shards by itself, exactly
-        log_every_n_steps=1,  # all is logged by epoch; a larger number only makes Lightning warn
     )

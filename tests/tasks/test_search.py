@@ -145,10 +145,11 @@ def test_a_trial_that_fails_is_told_and_the_search_goes_on(command: Command, tmp
 
 
 def test_mistakes_in_a_search_give_one_line(command: Command, tmp_path: Path) -> None:
+    trials = "hydra.sweeper.search.trials=1"
     cases = {
-        ("loss=l1", "hydra.sweeper.search.trials=2"): "search: nothing to search over. Give a key a range, as in ",
-        (SPACE, "hydra.sweeper.search.trials=1", "+hydra.sweeper.search.trails=2"): "hydra.sweeper.search: no 'trails'. Did you mean 'trials'?",
-        ("optim.lr=choice(-1,-2)", "hydra.sweeper.search.trials=1"): "search: none of 1 trials finished. See ",
+        ("loss=l1", trials): "search: nothing to search over. Give a key a range, as in ",
+        (SPACE, trials, "+hydra.sweeper.search.trails=2"): "hydra.sweeper.search: no 'trails'. Did you mean 'trials'?",
+        ("optim.lr=choice(-1,-2)", trials): "search: none of 1 trials finished. See ",
     }  # fmt: skip
     for number, (arguments, message) in enumerate(cases.items()):
         done = searched(command, *arguments, f"sweep_dir=s{number}")
