@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from hudepth import run_dir
 from hudepth.cli import LAUNCHERS, one_line
 from hudepth.errors import ConfigError
-from hudepth.sweeps import FAILED, FINISHED, PRUNED, write_jobs
+from hudepth.sweeps import FAILED, FINISHED, PRUNED, read_jobs, write_jobs
 from hudepth.tasks.config import plain
 from hudepth.tasks.job import cores
 from hudepth.tasks.sweep_jobs import Job, combine, compose, find_done
@@ -187,6 +187,13 @@ class Sweep(Sweeper):
                 "or pass hydra/launcher=submitit_local or joblib."
             )
 
+    def _report_command(self, folder: Path) -> str:
+        protocols = [name for name, protocol in (self.master.protocol or {}).items() if protocol]
+        words = ["hudepth-report", "sweep", f"dir={_shown(folder)}"]
+        words += [f"name={self.master.name}"] if len(read_jobs(folder)) > 1 else []
+        words += [f"protocol={protocols[0]}"] if protocols and "eigen" not in protocols else []  # its default
+        return shlex.join(words)
+
     def _folder(self) -> Path:
         typed = self.master.get("sweep_dir")
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
@@ -202,7 +209,8 @@ class Sweep(Sweeper):
         words = [f"{number} {state}" for state, number in count.items() if number or state == FINISHED]
         words += [f"{unfinished} unfinished"] if unfinished else []
         say(f"sweep {self.master.name}: {', '.join(words)}; in {folder}")
-        say(f"table and plots: hudepth-report sweep dir={_shown(folder)}")
+        if self.master.test:
+            say(f"table and plots: {self._report_command(folder)}")
         if unfinished or count[FAILED]:
             say(f"to go on: {_command(folder)}")
         return [f"{job.name}: {why}" for job, (state, why) in zip(jobs, outcomes, strict=True) if state == FAILED]

@@ -77,7 +77,7 @@ def test_lines_tell_what_each_job_does(command: Command, tmp_path: Path) -> None
             re.match(rf"\[{number}/2\] loss={loss}: epoch [12] of 2, val/abs_rel 0\.\d+", line) for line in lines
         )
     assert lines[-2] == f"sweep tried: 2 finished; in {tmp_path}/s"
-    assert lines[-1] == "table and plots: hudepth-report sweep dir=s"
+    assert lines[-1] == "table and plots: hudepth-report sweep dir=s protocol=paper"
     assert done.out == ""  # results are in the runs
     log = (runs(tmp_path / "s")["l1"] / "train.log").read_text()
     assert "epoch 2 of 2: train/total" in log
