@@ -121,8 +121,11 @@ def test_a_worker_that_is_killed_costs_no_other_job(tmp_path: Path, cache: Path)
     assert f"{len(left)} unfinished" in out
 
 
-def test_jobs_of_a_cluster(tmp_path: Path, cache: Path) -> None:
-    out = finish(tmp_path, cache, "-m", *FAST, "loss=l1,l2", "sweep_dir=s", "hydra/launcher=submitit_local")
+@pytest.mark.parametrize("launcher", ["submitit_local", "ray"])
+def test_jobs_of_a_cluster(launcher: str, tmp_path: Path, cache: Path) -> None:
+    if launcher == "ray":
+        pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="ray is large, and no part of the dev extra")
+    out = finish(tmp_path, cache, "-m", *FAST, "loss=l1,l2", "sweep_dir=s", f"hydra/launcher={launcher}")
     assert states(tmp_path / "s") == {"l1": "finished", "l2": "finished"}
     assert re.search(r"^\[1/2\] loss=l1: epoch 1 of 1, val/abs_rel 0\.\d+", out, re.MULTILINE)
     assert len({json.loads((run / "status.json").read_text())["pid"] for run in runs(tmp_path / "s").values()}) == 2
