@@ -112,10 +112,7 @@ class Sweep(Sweeper):
             if job.error:
                 say(f"{job.name}: {job.error}")
         done = sum(job.finished for job in jobs)
-        say(
-            f"sweep {self.master.name}: {len(left)} of {len(jobs)} jobs to run"
-            + (f", {done} finished before" * bool(done))
-        )
+        say(f"sweep {self.name}: {len(left)} of {len(jobs)} jobs to run" + (f", {done} finished before" * bool(done)))
         try:
             self.launch(left, folder)
         except BaseException:
@@ -132,7 +129,7 @@ class Sweep(Sweeper):
 
     def record(self, jobs: Sequence[Job], folder: Path) -> None:
         """Write the jobs to sweep.yaml."""
-        write_jobs(folder, str(self.master.name), [_record(job) for job in jobs])
+        write_jobs(folder, self.name, [_record(job) for job in jobs])
 
     def launch(self, jobs: Sequence[Job], folder: Path) -> None:
         """Launch jobs. Where a launcher gives up since one of its processes was killed, the rest is launched anew."""
@@ -190,14 +187,21 @@ class Sweep(Sweeper):
     def _report_command(self, folder: Path) -> str:
         protocols = [name for name, protocol in (self.master.protocol or {}).items() if protocol]
         words = ["hudepth-report", "sweep", f"dir={_shown(folder)}"]
-        words += [f"name={self.master.name}"] if len(read_jobs(folder)) > 1 else []
+        words += [f"name={self.name}"] if len(read_jobs(folder)) > 1 else []
         words += [f"protocol={protocols[0]}"] if protocols and "eigen" not in protocols else []  # its default
         return shlex.join(words)
+
+    @property
+    def name(self) -> str:
+        """As it was typed, else as its file in conf/sweep is called: an experiment beside it names the runs."""
+        chosen = self.master.hydra.runtime.choices.get("sweep")
+        typed = any(str(each).startswith("name=") for each in self.master.hydra.overrides.task)
+        return str(self.master.name if typed or not chosen else chosen)
 
     def _folder(self) -> Path:
         typed = self.master.get("sweep_dir")
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        folder = Path(str(typed)) if typed else Path(str(self.master.paths.sweeps)) / str(self.master.name) / stamp
+        folder = Path(str(typed)) if typed else Path(str(self.master.paths.sweeps)) / self.name / stamp
         return folder.expanduser().resolve()
 
     def _say_outcome(self, jobs: Sequence[Job], folder: Path) -> list[str]:
@@ -208,7 +212,7 @@ class Sweep(Sweeper):
         unfinished = len(jobs) - sum(count.values())
         words = [f"{number} {state}" for state, number in count.items() if number or state == FINISHED]
         words += [f"{unfinished} unfinished"] if unfinished else []
-        say(f"sweep {self.master.name}: {', '.join(words)}; in {folder}")
+        say(f"sweep {self.name}: {', '.join(words)}; in {folder}")
         if self.master.test:
             say(f"table and plots: {self._report_command(folder)}")
         if unfinished or count[FAILED]:

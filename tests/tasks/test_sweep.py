@@ -287,6 +287,16 @@ def test_a_run_that_another_process_works_on_is_left_to_it(
     assert status(run) == {"state": "running", "pid": 4711}
 
 
+def test_a_sweep_is_called_by_its_file_also_beside_an_experiment(command: Command, tmp_path: Path) -> None:
+    fast = [word for word in FAST if not word.startswith("name=")]
+    arguments = ("+sweep=loss_terms", "+experiment=demo", *fast, "variant=l1", "seed=1", "test=false")
+    done = command("train", *arguments, "schedule=constant")
+    assert done.code == 0, done.err
+    (folder,) = (tmp_path / "sweeps" / "loss_terms").iterdir()
+    assert list(read_jobs(folder)) == ["loss_terms"]
+    assert list(states(folder).values()) == ["finished"]
+
+
 def test_without_a_folder_there_is_a_dated_one(command: Command, tmp_path: Path) -> None:
     assert command("train", "-m", *FAST, "loss=l1", "test=false").code == 0
     (folder,) = (tmp_path / "sweeps" / "tried").iterdir()
