@@ -103,7 +103,7 @@ class Sweep(Sweeper):
             The jobs, with their folders.
 
         Raises:
-            ConfigError: after all, if a job failed or did not compose.
+            ConfigError: after all, if a job failed, did not compose or did not end.
         """
         jobs = find_done(jobs, folder)
         left = [job for job in jobs if job.config is not None and not job.finished]
@@ -118,12 +118,16 @@ class Sweep(Sweeper):
         except BaseException:
             self._say_outcome(jobs, folder)
             raise
-        failed = self._say_outcome(jobs, folder)
+        failed, unfinished = self._say_outcome(jobs, folder)
         if failed:
             more = f"; {len(failed) - 3} more" if len(failed) > 3 else ""
             words = "; ".join(line.rstrip(".") for line in failed[:3])
             raise ConfigError(
                 f"{len(failed)} of {len(jobs)} jobs failed: {words}{more}. See {_shown(folder)}/*/train.log."
+            )
+        if unfinished:
+            raise ConfigError(
+                f"{unfinished} of {len(jobs)} jobs did not end. Type the command above to go on with them."
             )
         return jobs
 
@@ -204,8 +208,8 @@ class Sweep(Sweeper):
         folder = Path(str(typed)) if typed else Path(str(self.master.paths.sweeps)) / self.name / stamp
         return folder.expanduser().resolve()
 
-    def _say_outcome(self, jobs: Sequence[Job], folder: Path) -> list[str]:
-        """Say what came of the jobs, and how to go on; return a line for each that failed."""
+    def _say_outcome(self, jobs: Sequence[Job], folder: Path) -> tuple[list[str], int]:
+        """Say what came of the jobs, and how to go on; return a line for each that failed, and how many did not end."""
         outcomes = [run_dir.state(folder / job.folder) if job.config else (FAILED, job.error) for job in jobs]
         states = [state for state, _ in outcomes]
         count = {state: states.count(state) for state in (FINISHED, FAILED, PRUNED)}
@@ -217,7 +221,8 @@ class Sweep(Sweeper):
             say(f"table and plots: {self._report_command(folder)}")
         if unfinished or count[FAILED]:
             say(f"to go on: {_command(folder)}")
-        return [f"{job.name}: {why}" for job, (state, why) in zip(jobs, outcomes, strict=True) if state == FAILED]
+        failed = [f"{job.name}: {why}" for job, (state, why) in zip(jobs, outcomes, strict=True) if state == FAILED]
+        return failed, unfinished
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -284,6 +284,10 @@ def test_a_run_that_another_process_works_on_is_left_to_it(
         done = sweep(command, "loss=l1,l2")
     assert f"'{run}' is being worked on by another process (number 4711)" in done.err
     assert "sweep tried: 1 finished, 1 unfinished" in done.err
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        "hudepth-train: 1 of 2 jobs did not end. Type the command above to go on with them."
+    )
     assert status(run) == {"state": "running", "pid": 4711}
 
 

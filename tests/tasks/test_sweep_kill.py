@@ -119,6 +119,7 @@ def test_a_worker_that_is_killed_costs_no_other_job(tmp_path: Path, cache: Path)
     left = [name for name, state in states(tmp_path / "s").items() if state != "finished"]
     assert 1 <= len(left) <= 2, out  # the victim, and perhaps the one whose pool went down with it
     assert f"{len(left)} unfinished" in out
+    assert process.returncode == 1
 
 
 @pytest.mark.parametrize("launcher", ["submitit_local", "ray"])
