@@ -137,7 +137,7 @@ def read_sweep(folder: str | Path, *, name: str | None = None) -> Sweep:
     runs = []
     for run in [*order, *(other for other in found if other not in order and name is None)]:
         if run not in found:
-            notes.append(f"'{run}' is in {SWEEP_FILE}, but there is no such folder")
+            notes.append(f"'{run}' has not begun: {SWEEP_FILE} names it, and there is no such folder")
             continue
         try:
             runs.append(read_run(found[run], labels=labels.get(run, {})))
