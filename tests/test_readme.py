@@ -96,8 +96,12 @@ def test_all_blocks_are_of_a_kind_that_is_tested() -> None:
 
 
 def test_links_lead_somewhere() -> None:
+    headings = [line[3:].lower().replace(" ", "-") for line in README.splitlines() if line.startswith("## ")]
     for target in re.findall(r"\]\(([^)]+)\)", README):
-        assert target.startswith("https://") or (ROOT / target).exists(), target
+        if target.startswith("#"):
+            assert target[1:] in headings, target
+        else:
+            assert target.startswith("https://") or (ROOT / target).exists(), target
 
 
 def test_the_results_are_those_of_the_run() -> None:

@@ -119,7 +119,9 @@ def test_a_sweep_is_read_in_its_order_and_what_is_no_run_is_noted(tmp_path: Path
     assert foreign.startswith(f"left alone: '{tmp_path}/foreign' is no run directory: its config.yaml cannot be read (")
     assert half.startswith(f"left alone: '{tmp_path}/half' is no run directory: its config.yaml cannot be read (")
     assert odd == f"left alone: '{tmp_path}/odd' is no run of hudepth-train: its config.yaml has no 'seed'"
-    assert [note for note in sweep.notes if "gone" in note] == ["'gone' has not begun: sweep.yaml names it, and there is no such folder"]
+    assert [note for note in sweep.notes if "gone" in note] == [
+        "'gone' has not begun: sweep.yaml names it, and there is no such folder"
+    ]
 
 
 def test_a_run_that_is_held_is_running(tmp_path: Path) -> None:
