@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 from pathlib import Path
@@ -67,3 +68,20 @@ def test_every_result_of_a_study_can_be_read() -> None:
     assert len(files) > 15
     for file in files:
         assert find_result(file.parent, file.parent.name).metrics["abs_rel"] > 0
+
+
+def test_badcl_ablation() -> None:
+    study = STUDIES / "badcl_ablation"
+    spec = importlib.util.spec_from_file_location("publish", study / "publish.py")
+    assert spec
+    assert spec.loader
+    publish = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(publish)
+    text = (study / "README.md").read_text()
+    for name in publish.SWEEPS:
+        document = json.loads((study / name / "document.json").read_text())
+        _, table, _ = text.split(f"<!-- {name} -->\n")
+        assert table.strip() == publish.table(document)
+    for file in study.rglob("*"):
+        if file.suffix in (".json", ".yaml", ".html", ".csv", ".md", ".tex"):
+            assert not re.search(r"/(root|work|home)/", file.read_text()), file

@@ -16,6 +16,8 @@ from hudepth.files import write_between, write_text
 
 HERE = Path(__file__).parent
 SWEEPS = ("loss_terms", "badcl_reading", "attention")
+EVIDENCE = ("paper", "l1")
+"""Variants of which one run is kept."""
 SHOWN = ("abs_rel", "rmse", "ssim", "delta1", "edge_f1_0.25")
 PLACES = {"abs_rel": 4, "rmse": 3, "ssim": 4, "delta1": 3, "edge_f1_0.25": 3}
 MARKS = {"better": " ▲", "worse": " ▼"}
@@ -41,15 +43,22 @@ def cell(row: dict[str, Any], name: str) -> str:
     return f"**{text}**" if metric["best"] else text
 
 
+def copy_run(run: Path, target: Path) -> None:
+    """Copy what a run says, not its weights and pictures: whole, for the ledger of the paper's claims."""
+    for pattern in ("*.yaml", "*.json", "metrics.csv", "test/*/metrics.json", "test/*/per_image.csv"):
+        for file in run.glob(pattern):
+            (target / file.relative_to(run)).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(file, target / file.relative_to(run))
+
+
 def main(sweep: Path, *shortened: str) -> None:
     for name in SWEEPS:
         words = ["hudepth-report", "sweep", f"dir={sweep}", f"name={name}", f"output={HERE / name}", "panels=4"]
         subprocess.run([str(Path(sys.executable).parent / words[0]), *words[1:]], check=True)
-    first = next(
-        run for run in sorted(sweep.iterdir()) if run.name.startswith("paper") and (run / "config.yaml").is_file()
-    )
-    for file in (first / "config.yaml", first / "environment.json", sweep / "sweep.yaml"):
-        shutil.copy(file, HERE / file.name)
+    shutil.copy(sweep / "sweep.yaml", HERE / "sweep.yaml")
+    for name in EVIDENCE:
+        run = next(run for run in sorted(sweep.glob(f"{name}_s*1*")) if (run / "test").is_dir())
+        copy_run(run, HERE / f"{name}_seed_1")
     for file in HERE.rglob("*"):
         if file.suffix in (".json", ".yaml", ".html", ".csv", ".md", ".tex"):
             text = file.read_text(encoding="utf-8")
