@@ -53,7 +53,7 @@ def copy_run(run: Path, target: Path) -> None:
 
 def main(sweep: Path, *shortened: str) -> None:
     for name in SWEEPS:
-        words = ["hudepth-report", "sweep", f"dir={sweep}", f"name={name}", f"output={HERE / name}", "panels=4"]
+        words = ["hudepth-report", "sweep", f"dir={sweep}", f"name={name}", f"output={HERE / name}", "panels=2"]
         subprocess.run([str(Path(sys.executable).parent / words[0]), *words[1:]], check=True)
     shutil.copy(sweep / "sweep.yaml", HERE / "sweep.yaml")
     for name in EVIDENCE:
