@@ -172,7 +172,7 @@ def _config_line(error: BaseException, task: str) -> str | None:
             return f"{group}={name}: its package is not installed. Run pip install 'hudepth[{LAUNCHERS[name]}]'."
         options = options_of(group)
         if options:
-            options += [each for each in (*LAUNCHERS, "basic") if group == "hydra/launcher"]
+            options += [each for each in (*LAUNCHERS, "basic") if group == "hydra/launcher" and each not in options]
             return f"{group}: no '{name}'.{did_you_mean(name, options)} Pass one of {', '.join(options)}."
     if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
         key = found[1] or getattr(error, "full_key", None) or found[2]
