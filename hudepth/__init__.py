@@ -1,6 +1,42 @@
 """hudepth: monocular depth estimation with a hybrid UNet and the BADCL loss.
 
-The package imports nothing heavy: ``import hudepth`` takes milliseconds, torch is loaded by the module that needs it.
+The package imports nothing heavy: ``import hudepth`` takes milliseconds, torch is loaded by what needs it.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hudepth.inference.depth_map import DepthMap
+    from hudepth.inference.model import DepthModel
+
 __version__ = "0.1.0"
+__all__ = ["DepthMap", "DepthModel", "load"]
+
+
+def load(spec: Any, **options: Any) -> DepthModel:
+    """Load a model to predict with; see :func:`hudepth.inference.model.load` for the options.
+
+    Args:
+        spec: a checkpoint, run directory, bundle, exported file, or ``last`` for the newest run.
+        **options: ``backend``, ``device``, ``precision``, ``threads``, ``size``, ``fit``, ``trust``, ``runs``.
+
+    Raises:
+        HudepthError: with one line that says what to do.
+    """
+    from hudepth.inference.model import load as load_model
+
+    return load_model(spec, **options)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "DepthMap":
+        from hudepth.inference.depth_map import DepthMap
+
+        return DepthMap
+    if name == "DepthModel":
+        from hudepth.inference.model import DepthModel
+
+        return DepthModel
+    raise AttributeError(f"module 'hudepth' has no attribute '{name}'")

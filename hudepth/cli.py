@@ -44,6 +44,26 @@ def report() -> int:
     return _main("report")
 
 
+def predict() -> int:
+    """Run ``hudepth-predict``."""
+    return _main("predict")
+
+
+def export() -> int:
+    """Run ``hudepth-export``."""
+    return _main("export")
+
+
+def bench() -> int:
+    """Run ``hudepth-bench``."""
+    return _main("bench")
+
+
+def demo() -> int:
+    """Run ``hudepth-demo``."""
+    return _main("demo")
+
+
 def _main(task: str) -> int:
     """Run one task with the arguments of this process; return its exit code."""
     arguments = sys.argv[1:]
@@ -79,7 +99,7 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     ``data`` is in a checkpoint, a ``data.root=x`` without ``data=`` becomes ``++data.root=x``.
 
     Args:
-        task: train, test, data or report.
+        task: the word after ``hudepth-``.
         arguments: without the program's name.
 
     Raises:
@@ -97,7 +117,7 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     result = [*flags, *(a for a in result if a not in flags)]  # between overrides argparse would stumble over them
     if any(a.startswith("resume=") for a in result):  # the keys are those of the run, which Hydra does not know
         result = [f"++{a}" if "." in a.partition("=")[0] and a[0] not in "+~" else a for a in result]
-    if task in ("test", "report") and not any(a.startswith(("data=", "+data=")) for a in result):
+    if task in ("test", "report", "export", "bench") and not any(a.startswith(("data=", "+data=")) for a in result):
         result = [f"++{a}" if a.startswith("data.") else a for a in result]
     return result
 

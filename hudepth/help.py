@@ -9,6 +9,10 @@ ABOUT = {
     "test": "Score a checkpoint. It needs nothing but the checkpoint: model, data and split are recorded in it.",
     "data": "Prepare a data set once as a depth store, show what is known of it, or audit it for leaks and units.",
     "report": "Compare two runs, put several or a whole sweep in one table, draw figures, or check the paper's claims.",
+    "predict": "Predict depth in metres for images, folders, videos or a camera, with any model file of hudepth's.",
+    "export": "Write a checkpoint as ONNX, torch.export, OpenVINO, int8 or a bundle to share, each checked against it.",
+    "bench": "Measure speed and memory of a model on this machine, in every backend, beside other networks.",
+    "demo": "Open a page on this machine: drop a picture, see its depth, read distances, turn the point cloud.",
 }
 
 USAGE = {
@@ -16,6 +20,10 @@ USAGE = {
     "test": "hudepth-test checkpoint=<file | run directory | last> [data=NAME] [protocol=NAME] [key=value ...]",
     "data": "hudepth-data prepare|info|audit data=NAME [data.root=PATH] [key=value ...]",
     "report": "hudepth-report compare|table|sweep|figures|paper [key=value ...]",
+    "predict": "hudepth-predict checkpoint=<model> input=<image | folder | 'glob' | video | camera> [output=DIR]",
+    "export": "hudepth-export checkpoint=<model> format=[onnx,openvino,torch_export,int8,bundle] [output=DIR]",
+    "bench": "hudepth-bench checkpoint=<model> | model=NAME [key=value ...]",
+    "demo": "hudepth-demo checkpoint=<model> [port=7860]",
 }
 
 EXAMPLES = {
@@ -52,6 +60,32 @@ EXAMPLES = {
         ("hudepth-report figures run=last", "loss curves and RGB / truth / prediction panels of a run"),
         ("hudepth-report paper", "what the paper claims beside what is measured here and now"),
         ("hudepth-report paper runs=[A,B]", "with runs of yours as evidence"),
+    ),
+    "predict": (
+        (
+            "hudepth-predict checkpoint=last input=photos",
+            "a folder: 16-bit PNG [mm], npy [m] and a picture for each image",
+        ),
+        ("hudepth-predict checkpoint=model.onnx input=a.jpg formats=[ply]", "a point cloud, from an exported file"),
+        ("hudepth-predict checkpoint=last input=walk.mp4 smoothing=0.6", "a video of depth, steadied"),
+        ("hudepth-predict checkpoint=last input=0 frames=100", "the first camera"),
+    ),
+    "export": (
+        ("hudepth-export checkpoint=last format=onnx", "uint8 RGB in, metres out, any batch size"),
+        ("hudepth-export checkpoint=last format=[openvino,int8]", "the fastest on CPUs, exact and quantised"),
+        ("hudepth-export checkpoint=last format=bundle zip=true", "weights, configuration, ONNX, model card, samples"),
+    ),
+    "bench": (
+        ("hudepth-bench checkpoint=last", "every backend that is installed, batches of 1 to 32"),
+        ("hudepth-bench model=hybrid_unet backends=[eager,openvino] batches=[1]", "two backends, random weights"),
+        (
+            "hudepth-bench checkpoint=last peers=true",
+            "beside Depth Anything V2 small, DPT-hybrid, GLPN, a MobileNet UNet",
+        ),
+    ),
+    "demo": (
+        ("hudepth-demo checkpoint=last", "at http://127.0.0.1:7860, for this machine alone"),
+        ("hudepth-demo checkpoint=model.onnx port=8000", "an exported file, on another port"),
     ),
 }
 

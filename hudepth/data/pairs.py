@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.data.encoding import to_metres
+from hudepth.data.resize import resize_image
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.store import to_mm
 from hudepth.errors import DataError
+from hudepth.machine import usable_cores
 
 POOL_FROM = 32
 """Fewer pairs than this are prepared in this process: starting others would take longer."""
@@ -70,12 +72,11 @@ def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, nativ
     if not measured.size:
         raise DataError(f"'{record.depth or record.id}': the depth is zero everywhere, nothing is measured.")
     height, width = size
-    shrinks = raw.image.shape[0] >= height and raw.image.shape[1] >= width
-    image = cv2.resize(raw.image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    image = resize_image(raw.image, size)
     depth = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     png = cv2.imencode(".png", to_mm(depth_m), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel() if native else None
     return PreparedPair(
-        image=image.astype(np.uint8, copy=False),
+        image=image,
         depth_mm=to_mm(depth.astype(np.float32, copy=False)),
         native_png=None if png is None else png.astype(np.uint8, copy=False),
         native_size=(depth_m.shape[0], depth_m.shape[1]),
@@ -88,7 +89,7 @@ def prepare_pairs(
     source: Source, records: Sequence[Record], size: tuple[int, int], *, native: bool, workers: int | None
 ) -> Generator[tuple[Record, PreparedPair | str], None, None]:
     """Yield each record with its prepared pair, or with the line that says why there is none; in order."""
-    workers = workers or _cores()
+    workers = workers or usable_cores()
     if workers == 1 or len(records) < POOL_FROM:
         for record in records:
             yield record, _outcome(source, record, size, native=native)
@@ -113,11 +114,6 @@ def prepare_pairs(
         finally:
             for _, future in waiting:
                 future.cancel()
-
-
-def _cores() -> int:
-    """Cores this process may use, where the system tells."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _outcome(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair | str:

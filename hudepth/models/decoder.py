@@ -27,6 +27,7 @@ class UpBlock(nn.Module):
     ) -> None:
         super().__init__()
         self.upsample = upsample
+        self.channels_in = channels_in
         self.conv1 = nn.Conv2d(channels_in + channels_skip, channels_out, 3, padding=1)
         self.bn1 = nn.BatchNorm2d(channels_out)
         self.conv2 = nn.Conv2d(channels_out, channels_out, 3, padding=1)

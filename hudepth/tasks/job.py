@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from hudepth import run_dir
 from hudepth.cli import one_line
 from hudepth.console import setup_logging
+from hudepth.machine import usable_cores
 
 
 def run_job(cfg: DictConfig) -> None:
@@ -59,12 +60,7 @@ def _share_machine(cfg: DictConfig) -> None:
         return
     import torch
 
-    torch.set_num_threads(max(1, cores() // side_by_side) if side_by_side > 0 else 1)
+    torch.set_num_threads(max(1, usable_cores() // side_by_side) if side_by_side > 0 else 1)
     gpus = torch.cuda.device_count()
     if gpus > 1 and cfg.trainer.accelerator in ("auto", "gpu", "cuda"):
         cfg.trainer.devices = [int(hydra.job.num) % gpus]
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

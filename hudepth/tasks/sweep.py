@@ -27,9 +27,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from hudepth import run_dir
 from hudepth.cli import LAUNCHERS, one_line
 from hudepth.errors import ConfigError
+from hudepth.machine import usable_cores
 from hudepth.sweeps import FAILED, FINISHED, PRUNED, read_jobs, write_jobs
 from hudepth.tasks.config import plain
-from hudepth.tasks.job import cores
 from hudepth.tasks.sweep_jobs import Job, combine, compose, find_done
 from hudepth.tasks.sweep_progress import Progress, say
 
@@ -164,7 +164,7 @@ class Sweep(Sweeper):
         if config.hydra.launcher.get("n_jobs") is not None:
             with open_dict(config):
                 if not any(each.lstrip("+").startswith("hydra.launcher.n_jobs=") for each in typed):
-                    config.hydra.launcher.n_jobs = cores()
+                    config.hydra.launcher.n_jobs = usable_cores()
                 if config.hydra.launcher.n_jobs > jobs:  # a core is not kept for a job that there is not
                     config.hydra.launcher.n_jobs = jobs
         launcher: Launcher = Plugins.instance().instantiate_launcher(

@@ -229,6 +229,9 @@ def build_module(
         record={
             "config": config,
             "split": datamodule.split.summary(),
-            "data": {key: datamodule.store.info[key] for key in ("source", "fingerprint", "encoding", "pairs")},
+            "data": {
+                key: datamodule.store.info[key]
+                for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")
+            },
         },
     )

@@ -6,8 +6,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from hudepth.machine import usable_cores
 from hudepth.tasks import job
-from hudepth.tasks.job import cores
 
 
 def shared(
@@ -42,4 +42,4 @@ def test_else_the_devices_stay(n_jobs: int, gpus: int, accelerator: str, monkeyp
 
 
 def test_there_is_a_core() -> None:
-    assert cores() >= 1
+    assert usable_cores() >= 1

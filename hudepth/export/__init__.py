@@ -1,0 +1,1 @@
+"""From a checkpoint to files that other programs run: each is checked against the checkpoint before it is kept."""

@@ -1,0 +1,1 @@
+"""A trained model in use: images in, depth in metres out, whatever file the model comes from."""

@@ -1,0 +1,66 @@
+"""A predicted depth map, and the forms people want it in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from hudepth.data.store import to_mm
+from hudepth.viz.colour import colour_depth
+from hudepth.viz.point_cloud import Intrinsics, PointCloud, point_cloud
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of an image, pixel by pixel."""
+
+    metres: Float[np.ndarray, "h w"]
+    """Distance along the optical axis [m], float32."""
+    image: UInt8[np.ndarray, "h w 3"]
+    """The image it was predicted from, upright, RGB."""
+    max_depth_m: float
+    """The largest depth the model can tell."""
+    notes: tuple[str, ...] = ()
+    """What was done to the image on the way in, where it is not obvious."""
+
+    def to_png16(self) -> bytes:
+        """Return a 16-bit PNG file in millimetres: the form in which NYU, ScanNet and Kinect tools keep depth.
+
+        Depth is rounded to the nearest millimetre and ends at 65.535 m.
+        """
+        # Level 1 with RLE: a tenth larger than the default, in a fraction of its time.
+        options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+        return cv2.imencode(".png", to_mm(self.metres), options)[1].tobytes()
+
+    def colourise(
+        self, *, scale_m: tuple[float, float] | None = None, legend: bool = True
+    ) -> UInt8[np.ndarray, "h w2 3"]:
+        """Return depth as RGB colours, near red and far blue, on a fixed scale with a legend in metres.
+
+        Args:
+            scale_m: depths of the two ends of the scale; from 0 to ``max_depth_m`` by default.
+            legend: whether the scale stands beside it.
+
+        Raises:
+            ConfigError: if the scale is not two rising numbers.
+        """
+        return colour_depth(self.metres, scale_m=scale_m or (0.0, self.max_depth_m), legend=legend)
+
+    def side_by_side(self, *, scale_m: tuple[float, float] | None = None) -> UInt8[np.ndarray, "h w2 3"]:
+        """Return the image with its coloured depth to the right."""
+        return np.hstack([self.image, self.colourise(scale_m=scale_m)])
+
+    def point_cloud(self, intrinsics: Intrinsics | tuple[float, float, float, float] | None = None) -> PointCloud:
+        """Return a coloured point in space for each pixel.
+
+        Args:
+            intrinsics: fx, fy, cx, cy of the camera [pixels of the image]; NYU's scaled to the image by default.
+
+        Raises:
+            ConfigError: if they are no camera's.
+        """
+        camera = Intrinsics(*intrinsics) if isinstance(intrinsics, tuple) else intrinsics
+        return point_cloud(self.metres, self.image, camera)

@@ -1,0 +1,85 @@
+"""Depth as colour: a fixed scale in metres, and a legend that says what it is."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from hudepth.errors import ConfigError
+
+UNMEASURED_GREY = 191
+"""Where depth is 0: a light grey that the scale does not contain."""
+
+
+def colour_depth(
+    depth_m: Float[np.ndarray, "h w"], *, scale_m: tuple[float, float], legend: bool = True
+) -> UInt8[np.ndarray, "h w2 3"]:
+    """Paint depth on a fixed scale: near is red, far is blue (turbo, reversed).
+
+    Args:
+        depth_m: metres, 0 where unmeasured.
+        scale_m: depths of the two ends; what lies beyond has the colour of the end.
+        legend: whether a scale in metres is joined to the right.
+
+    Returns:
+        RGB; wider than the depth by the legend.
+
+    Raises:
+        ConfigError: if the scale is not two rising numbers.
+    """
+    near, far = _checked(scale_m)
+    shade = cv2.convertScaleAbs(depth_m - near, alpha=255 / (far - near)) if near else None
+    if shade is None:
+        shade = cv2.convertScaleAbs(depth_m, alpha=255 / far)  # rounds and clips at 255 by itself
+    else:
+        shade[depth_m < near] = 0
+    picture = cv2.applyColorMap(shade, _colours())
+    if not depth_m.all():
+        picture[depth_m == 0] = UNMEASURED_GREY
+    if not legend:
+        return np.asarray(picture, np.uint8)
+    return np.hstack([picture, _legend(depth_m.shape[0], near, far)])
+
+
+def _checked(scale_m: tuple[float, float]) -> tuple[float, float]:
+    try:
+        near, far = (float(value) for value in scale_m)
+    except (TypeError, ValueError):
+        near, far = 0.0, -1.0
+    if not 0 <= near < far < np.inf:
+        raise ConfigError(f"scale_m: {scale_m} is not two rising distances in metres. Pass scale_m=[0,10].")
+    return near, far
+
+
+@lru_cache(maxsize=1)
+def _colours() -> UInt8[np.ndarray, "256 1 3"]:
+    """Return turbo from far to near, as a table for OpenCV whose channels are RGB."""
+    ramp = np.arange(256, dtype=np.uint8)[::-1, None]
+    return np.ascontiguousarray(cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)[..., ::-1])
+
+
+@lru_cache(maxsize=8)
+def _legend(height: int, near: float, far: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the scale, as high as the picture beside it; a folder of pictures of one size needs one."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    dpi = float(np.clip(height / 4, 40, 200))
+    width = max(round(0.62 * dpi), 24)
+    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi)
+    margin = min(0.12 * dpi / height, 0.2)
+    bar = figure.add_axes((0.08, margin, 0.25, 1 - 2 * margin))
+    bar.imshow(_colours()[:, ::1].astype(float) / 255, aspect="auto", extent=(0, 1, far, near))
+    bar.set_xticks([])
+    bar.yaxis.tick_right()
+    bar.tick_params(labelsize=8, length=2, pad=2)
+    bar.set_ylabel("depth [m]", fontsize=8, labelpad=2)
+    bar.yaxis.set_label_position("right")
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = np.asarray(canvas.buffer_rgba())[:height, :, :3]
+    return np.ascontiguousarray(cv2.resize(drawn, (drawn.shape[1], height)), np.uint8)

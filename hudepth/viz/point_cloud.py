@@ -1,0 +1,102 @@
+"""Depth as points in space, and the PLY files that hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from hudepth.errors import ConfigError
+
+NYU_INTRINSICS = (518.857901, 519.469611, 325.582449, 253.736166)
+"""fx, fy, cx, cy of NYU Depth V2's colour camera [pixels], at 640 x 480 (Silberman et al. 2012, its toolbox)."""
+NYU_SIZE = (480, 640)
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion."""
+
+    fx: float
+    """Focal length [pixels]."""
+    fy: float
+    cx: float
+    """Principal point [pixels], from the centre of the first pixel."""
+    cy: float
+    known: bool = True
+    """False where NYU's camera stands in for one that nobody stated."""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.fx < np.inf and 0 < self.fy < np.inf and np.isfinite(self.cx) and np.isfinite(self.cy)):
+            raise ConfigError(
+                f"intrinsics: [{self.fx},{self.fy},{self.cx},{self.cy}] is no camera. "
+                "Pass intrinsics=[fx,fy,cx,cy] in pixels of the image."
+            )
+
+    @classmethod
+    def of_nyu(cls, height: int, width: int) -> Intrinsics:
+        """Return those of NYU's camera, scaled to another size: each axis on its own."""
+        fx, fy, cx, cy = NYU_INTRINSICS
+        x, y = width / NYU_SIZE[1], height / NYU_SIZE[0]
+        return cls(fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5, known=False)
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in the camera's frame: x right, y down, z forward [m]."""
+
+    points_m: Float[np.ndarray, "n 3"]
+    colours: UInt8[np.ndarray, "n 3"] | None
+    """RGB."""
+    comment: str = ""
+
+    def to_ply(self) -> bytes:
+        """Return a binary PLY file (little-endian), whose comment states axes, unit and camera."""
+        kinds: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+        if self.colours is not None:
+            kinds += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+        vertices = np.empty(len(self.points_m), dtype=kinds)
+        for axis, name in enumerate("xyz"):
+            vertices[name] = self.points_m[:, axis]
+        if self.colours is not None:
+            for channel, name in enumerate(("red", "green", "blue")):
+                vertices[name] = self.colours[:, channel]
+        types = {"<f4": "float", "u1": "uchar"}
+        lines = [
+            "ply", "format binary_little_endian 1.0",
+            *(f"comment {line}" for line in self.comment.splitlines()),
+            f"element vertex {len(vertices)}",
+            *(f"property {types[kind]} {name}" for name, kind in kinds),
+            "end_header",
+        ]  # fmt: skip
+        return "\n".join(lines).encode("ascii", "replace") + b"\n" + vertices.tobytes()
+
+
+def point_cloud(
+    depth_m: Float[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"] | None, intrinsics: Intrinsics | None = None
+) -> PointCloud:
+    """Lift each pixel to a point; pixels of depth 0 are left out.
+
+    Args:
+        depth_m: distance along the optical axis [m].
+        image: RGB of the same size, for colour.
+        intrinsics: of the camera, in pixels of ``depth_m``; NYU's scaled to its size by default, which the comment
+            says.
+    """
+    height, width = depth_m.shape
+    camera = intrinsics or Intrinsics.of_nyu(height, width)
+    x = (np.arange(width, dtype=np.float32) - camera.cx) / camera.fx
+    y = (np.arange(height, dtype=np.float32) - camera.cy) / camera.fy
+    points = np.stack(np.broadcast_arrays(depth_m * x, depth_m * y[:, None], depth_m), axis=-1).reshape(-1, 3)
+    points = np.asarray(points, np.float32)
+    colours = None if image is None else image.reshape(-1, 3)
+    seen = depth_m.reshape(-1) > 0
+    if not seen.all():
+        points, colours = points[seen], None if colours is None else colours[seen]
+    whose = "as given" if camera.known else f"NYU Depth V2's, scaled to {width} x {height}: not this camera's own"
+    comment = (
+        "x right, y down, z forward, in metres\n"
+        f"camera: fx {camera.fx:.3f} fy {camera.fy:.3f} cx {camera.cx:.3f} cy {camera.cy:.3f} pixels, {whose}"
+    )
+    return PointCloud(points, colours, comment)
