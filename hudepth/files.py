@@ -13,7 +13,7 @@ import yaml
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def written_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a path beside ``path`` to write to; rename it to ``path`` only if the block ends well.
 
     Whatever happens in between (an exception, a full disk, a kill), an earlier ``path`` stays as it was. After a
@@ -21,6 +21,8 @@ def written_whole(path: Path) -> Iterator[Path]:
 
     Args:
         path: the file to appear; its folder is made.
+        durable: wait until the disk has it, so that a power cut is no danger either; for thousands of files that can
+            be made again the wait is not worth it.
 
     Raises:
         OSError: whatever the file system says.
@@ -29,8 +31,9 @@ def written_whole(path: Path) -> Iterator[Path]:
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part
-        with part.open("rb") as file:
-            os.fsync(file.fileno())  # else a power cut could leave the new name with an empty file behind it
+        if durable:
+            with part.open("rb") as file:
+                os.fsync(file.fileno())  # else a power cut could leave the new name with an empty file behind it
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -54,13 +54,13 @@ class TorchBackend:
     name = "torch"
 
     def __init__(self, net: nn.Module, info: ModelInfo, *, device: torch.device) -> None:
-        self.info, self._device = info, device
+        self.info, self.device = info, device
         self.pipeline = DepthPipeline(net, max_depth_m=info.max_depth_m).to(device)
 
     def __call__(self, rgb: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
         """Return depth [m] of RGB images at the model's size."""
         with torch.inference_mode():
-            depth: torch.Tensor = self.pipeline(torch.from_numpy(rgb).to(self._device))
+            depth: torch.Tensor = self.pipeline(torch.from_numpy(rgb).to(self.device))
             return np.asarray(depth.cpu().numpy())
 
 

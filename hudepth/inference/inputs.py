@@ -1,0 +1,86 @@
+"""What ``input=`` means: one image, a folder, a pattern, a video, or the number of a camera."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from hudepth.errors import DataError
+from hudepth.inference.images import SUFFIXES
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+"""Extensions of videos, in lower case."""
+
+
+class Item(NamedTuple):
+    """A file to predict, and what its results are called."""
+
+    path: Path
+    stem: Path
+    """Below the output folder, without an ending."""
+
+
+class Inputs(NamedTuple):
+    """What there is to do."""
+
+    images: list[Item]
+    videos: list[Item]
+    camera: int | None = None
+
+
+def find_inputs(spec: str, *, recursive: bool) -> Inputs:
+    """Return what ``spec`` means, in the order of names.
+
+    Args:
+        spec: a file, a folder, a pattern with ``*``, ``?`` or ``**``, or the number of a camera.
+        recursive: whether folders below a folder are looked into; their names are kept in the results.
+
+    Raises:
+        DataError: if there is nothing; the message says what was looked for.
+    """
+    if spec.isdecimal() and not Path(spec).exists():
+        return Inputs([], [], camera=int(spec))
+    path = Path(spec).expanduser()
+    if path.is_dir():
+        root, files = path, sorted(path.rglob("*") if recursive else path.iterdir())
+    elif path.is_file():
+        root, files = path.parent, [path]
+    else:
+        root = _root_of(path)
+        files = sorted(root.glob(str(path.relative_to(root)))) if glob.has_magic(str(path)) else []
+        if not files:
+            raise DataError(
+                f"input: no file, folder or match '{spec}'. Pass an image, folder, 'pattern', video or camera."
+            )
+    files = [file for file in files if file.is_file() and not file.name.startswith(".")]
+    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+    alone = path.is_file()  # who names one file means it, whatever its ending
+    images = [f for f in files if f not in videos and (alone or f.suffix.lower() in SUFFIXES)]
+    if not images and not videos:
+        below = "" if recursive else " Folders below it are looked into with recursive=true."
+        raise DataError(
+            f"input: no image or video in '{spec}' ({', '.join(SUFFIXES)}, {', '.join(VIDEO_SUFFIXES)}).{below}"
+        )
+    items = _named(images + videos, root)
+    return Inputs(items[: len(images)], items[len(images) :])
+
+
+def _root_of(pattern: Path) -> Path:
+    parts = []
+    for part in pattern.parts[:-1]:
+        if glob.has_magic(part):
+            break
+        parts.append(part)
+    return Path(*parts)
+
+
+def _named(files: list[Path], root: Path) -> list[Item]:
+    """Name results after their files; where two differ in the ending alone, the ending becomes part of the name."""
+    stems = [file.relative_to(root).with_suffix("") for file in files]
+    times = Counter(stems)
+    return [
+        Item(file, stem if times[stem] == 1 else stem.with_name(file.name.replace(".", "_")))
+        for file, stem in zip(files, stems, strict=True)
+    ]
