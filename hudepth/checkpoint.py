@@ -12,7 +12,7 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
-from hudepth import run_dir
+from hudepth import bundles, run_dir
 from hudepth.errors import CheckpointError, TrainingError
 from hudepth.files import written_whole
 from hudepth.instantiate import instantiate
@@ -63,6 +63,8 @@ class Checkpoint:
     """Finished epochs."""
     state: dict[str, Tensor]
     """The network's tensors."""
+    size_bytes: int
+    """Of what the tensors were read from: no honest network is larger."""
 
     def build_net(self, *, trust: list[str]) -> nn.Module:
         """Return the network in evaluation mode.
@@ -83,7 +85,7 @@ class Checkpoint:
             model["weights"] = None  # the trunk's start does not matter any more
         only = object if trust else nn.Module
         if not trust:
-            if sum(tensor.nbytes for tensor in self.state.values()) > self.path.stat().st_size:
+            if sum(tensor.nbytes for tensor in self.state.values()) > self.size_bytes:
                 raise CheckpointError(f"'{self.path}' is refused: its tensors claim more memory than the file holds.")
             with torch.device("meta"):
                 self._check_fits(instantiate(model, only=only))
@@ -108,13 +110,15 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     """Return the file that ``spec`` means.
 
     Args:
-        spec: a file; a run directory (its best checkpoint, else its last); or ``last`` (the newest run).
+        spec: a file; a run directory (its best checkpoint, else its last); a bundle; or ``last`` (the newest run).
         runs: where ``last`` looks.
 
     Raises:
         CheckpointError: if there is no such file.
     """
     path = run_dir.newest_run(runs) if spec == "last" else Path(spec).expanduser()
+    if bundles.is_bundle(path):
+        return path
     if path.is_dir():
         folder = path / run_dir.CHECKPOINTS
         for name in (run_dir.BEST, run_dir.LAST):
@@ -181,33 +185,40 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         CheckpointError: if it is missing, damaged, holds code, or was not written by hudepth.
     """
     path = find_checkpoint(spec, runs=runs)
-    content = read_plain(path)
-    own = content.get(KEY)
-    if not isinstance(own, dict) or "state_dict" not in content:
-        raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
+    if bundles.is_bundle(path):
+        own, tensors, size_bytes = bundles.read_bundle(path)
+        epoch, run = own.get("epoch"), None
+    else:
+        content = read_plain(path)
+        if not isinstance(content.get(KEY), dict) or "state_dict" not in content:
+            raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
+        own, size_bytes = content[KEY], path.stat().st_size
+        tensors, run = content["state_dict"], run_dir.run_of(path.resolve())
+        epoch = content["epoch"] + 1 if isinstance(content.get("epoch"), int) else None
     if own.get("version") != VERSION:
         raise CheckpointError(f"'{path}' has checkpoint version {own.get('version')}; this hudepth reads {VERSION}.")
-    config, split, data, epoch = own.get("config"), own.get("split"), own.get("data"), content.get("epoch")
+    config, split, data = own.get("config"), own.get("split"), own.get("data")
     if not (
         isinstance(config, dict)
         and isinstance(config.get("model"), dict)
         and isinstance(split, dict)
         and isinstance(data, dict)
         and isinstance(epoch, int)
-        and _is_state(content["state_dict"])
+        and _is_state(tensors)
     ):
         raise CheckpointError(
             f"'{path}' is incomplete: its configuration, split, data, epoch or tensors are not there."
         )
-    state = {n.removeprefix(NET_PREFIX): v for n, v in content["state_dict"].items() if n.startswith(NET_PREFIX)}
+    state = {n.removeprefix(NET_PREFIX): v for n, v in tensors.items() if n.startswith(NET_PREFIX)}
     return Checkpoint(
         path=path,
-        run=run_dir.run_of(path.resolve()),
+        run=run,
         config=config,
         split=split,
         data=data,
-        epoch=epoch + 1,
+        epoch=epoch,
         state=state,
+        size_bytes=size_bytes,
     )
 
 

@@ -18,7 +18,8 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
-        wanted = {"checkpoint": "file | run directory | last", "input": "image | folder | video"}.get(missing[0], "value")
+        known = {"checkpoint": "file | run directory | last", "input": "image | folder | video | camera"}
+        wanted = known.get(missing[0], "value")
         raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<{wanted}>.")
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)

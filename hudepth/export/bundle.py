@@ -1,0 +1,76 @@
+"""Write a bundle; :mod:`hudepth.bundles` says what one is and reads it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hudepth import __version__
+from hudepth.bundles import CARD, CONFIG, KIND, ONNX, WEIGHTS
+from hudepth.checkpoint import VERSION, Checkpoint
+from hudepth.inference.depth_map import DepthMap
+from hudepth.inference.info import ModelInfo
+from hudepth.inference.writing import jpeg
+
+PLACES = ("root", "cache")
+"""Keys of ``data`` that say where things lie on the machine of the training, which is nobody else's business."""
+PARTS = ("name", "seed", "model", "data", "loss", "optim", "schedule")
+"""What of a run's configuration goes along."""
+
+
+def write_bundle(
+    folder: Path,
+    checkpoint: Checkpoint,
+    *,
+    info: ModelInfo,
+    onnx: Path,
+    card: str,
+    results: Mapping[str, Mapping[str, Any]],
+    samples: Sequence[DepthMap],
+) -> None:
+    """Write everything into an empty folder.
+
+    Args:
+        folder: is made.
+        checkpoint: whose tensors and record go along.
+        info: the same in short.
+        onnx: file to copy.
+        card: the model card.
+        results: contents of ``metrics.json`` by protocol.
+        samples: pictures to show.
+    """
+    from safetensors.torch import save
+
+    folder.mkdir(parents=True)
+    state = {name: tensor.contiguous() for name, tensor in checkpoint.state.items()}
+    (folder / WEIGHTS).write_bytes(save(state, metadata={"format": "pt", "hudepth": info.to_json()}))
+    config = {key: checkpoint.config[key] for key in PARTS if key in checkpoint.config}
+    if isinstance(config.get("model"), dict) and "weights" in config["model"]:
+        config["model"] = {**config["model"], "weights": None}  # the trunk's start, which may be a path
+    if isinstance(config.get("data"), dict):
+        config["data"] = {key: None if key in PLACES else value for key, value in config["data"].items()}
+    stated = {
+        "kind": KIND, "version": VERSION, "hudepth": __version__, "epoch": checkpoint.epoch,
+        "config": config, "split": checkpoint.split, "data": checkpoint.data,
+    }  # fmt: skip
+    (folder / CONFIG).write_text(json.dumps(stated, indent=2) + "\n", encoding="utf-8")
+    shutil.copyfile(onnx, folder / ONNX)
+    (folder / CARD).write_text(card, encoding="utf-8")
+    for protocol, result in results.items():
+        (folder / "metrics").mkdir(exist_ok=True)
+        (folder / "metrics" / f"{protocol}.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    for number, sample in enumerate(samples):
+        (folder / "samples").mkdir(exist_ok=True)
+        (folder / "samples" / f"{number}.jpg").write_bytes(jpeg(sample.side_by_side()))
+
+
+def zip_folder(folder: Path, path: Path) -> None:
+    """Put a folder into a zip, under its own name; weights do not compress, so nothing is."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                archive.write(file, Path(folder.name) / file.relative_to(folder))

@@ -1,0 +1,165 @@
+"""The network as a file for other programs: ONNX, ``torch.export``, OpenVINO."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hudepth import __version__
+from hudepth.errors import ConfigError
+from hudepth.files import written_whole
+from hudepth.inference.info import KEY, ModelInfo
+from hudepth.inference.pipeline import DepthPipeline
+
+OPSET = 18
+INPUT = "image"
+OUTPUTS = {True: "depth_m", False: "unit_depth"}
+"""Name of the output, by whether the graph holds the processing."""
+
+
+def export_graph(net: nn.Module, info: ModelInfo) -> tuple[nn.Module, Tensor]:
+    """Return what is exported, and an input for it.
+
+    Args:
+        net: normalised image to unit depth, as it shall run.
+        info: its size, and whether the processing is to be part of the graph.
+    """
+    height, width = info.size
+    if info.processing:
+        image = torch.randint(0, 256, (2, height, width, 3), dtype=torch.uint8)
+        return DepthPipeline(net, max_depth_m=info.max_depth_m).eval(), image
+    return net, torch.rand(2, 3, height, width)
+
+
+def describe(info: ModelInfo) -> dict[str, str]:
+    """Return what a file says to people and programs that do not know hudepth, and hudepth's own description."""
+    height, width = info.size
+    if info.processing:
+        takes = f"{INPUT}: uint8 [batch, {height}, {width}, 3], RGB, the whole image resized to this size"
+        gives = f"{OUTPUTS[True]}: float32 [batch, {height}, {width}], distance along the optical axis in metres"
+    else:
+        takes = (
+            f"{INPUT}: float32 [batch, 3, {height}, {width}], RGB in [0, 1] less (0.485, 0.456, 0.406), over "
+            "(0.229, 0.224, 0.225)"
+        )
+        gives = f"{OUTPUTS[False]}: float32 [batch, 1, {height}, {width}], depth / {info.max_depth_m:g} m"
+    return {
+        KEY: info.to_json(),
+        "input": takes,
+        "output": gives,
+        "max_depth_m": f"{info.max_depth_m:g}",
+        "trained_on": json.dumps(info.trained_on, sort_keys=True),
+        "producer": f"hudepth {__version__}",
+    }
+
+
+def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
+    """Write an ONNX file with any batch size, by torch's dynamo exporter.
+
+    Args:
+        net: normalised image to unit depth.
+        path: ``.onnx``, written whole or not at all.
+        info: what the file says of itself.
+
+    Raises:
+        ConfigError: if ``onnx`` or ``onnxscript`` is not installed.
+    """
+    for package in ("onnx", "onnxscript"):
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ConfigError(f"{package} is not installed. Run pip install 'hudepth[onnx]'.") from error
+    graph, image = export_graph(net, info)
+    with _quiet(), torch.no_grad():
+        program = torch.onnx.export(
+            graph, (image,), dynamo=True, opset_version=OPSET, verbose=False,
+            dynamic_shapes=({0: torch.export.Dim("batch", min=1)},),
+            input_names=[INPUT], output_names=[OUTPUTS[info.processing]],
+        )  # fmt: skip
+    assert program is not None
+    model = program.model_proto
+    for key, value in describe(info).items():
+        model.metadata_props.add(key=key, value=value)
+    model.producer_name = "hudepth"
+    with written_whole(path) as part:
+        part.write_bytes(model.SerializeToString())
+
+
+def export_program(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
+    """Write a ``torch.export`` program with any batch size.
+
+    Args:
+        net: normalised image to unit depth.
+        path: ``.pt2``, written whole or not at all.
+        info: what the file says of itself.
+    """
+    graph, image = export_graph(net, info)
+    with _quiet(), torch.no_grad():
+        program = torch.export.export(graph, (image,), dynamic_shapes=({0: torch.export.Dim("batch", min=1)},))
+        # saving looks at the ending, so the part is written under one that it likes
+        with written_whole(path) as part:
+            under = part.with_suffix(".pt2")
+            try:
+                torch.export.save(program, under, extra_files={f"{KEY}.json": info.to_json()})
+                under.replace(part)
+            finally:
+                under.unlink(missing_ok=True)
+
+
+def export_openvino(onnx: Path, path: Path, *, info: ModelInfo) -> None:
+    """Turn an ONNX file into OpenVINO's format, with float32 weights.
+
+    Args:
+        onnx: what :func:`export_onnx` wrote.
+        path: ``.xml``; the weights go into a ``.bin`` beside it.
+        info: what the file says of itself.
+
+    Raises:
+        ConfigError: if ``openvino`` is not installed.
+    """
+    save_openvino(openvino().Core().read_model(onnx), path, info=info)
+
+
+def save_openvino(model: Any, path: Path, *, info: ModelInfo) -> None:
+    """Write an OpenVINO model and its description."""
+    for key, value in describe(info).items():
+        model.set_rt_info(value, [key])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    openvino().save_model(model, path, compress_to_fp16=False)  # half precision would cost more than a millimetre
+
+
+def openvino() -> Any:
+    """Return the package.
+
+    Raises:
+        ConfigError: if it is not installed.
+    """
+    try:
+        return importlib.import_module("openvino")
+    except ImportError as error:
+        raise ConfigError("openvino is not installed. Run pip install 'hudepth[openvino]'.") from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the exporter's talk about packages that are not needed to itself."""
+    names = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")
+    levels = {name: logging.getLogger(name).level for name in names}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for name in names:
+                logging.getLogger(name).setLevel(logging.ERROR)
+            yield
+        finally:
+            for name, level in levels.items():
+                logging.getLogger(name).setLevel(level)

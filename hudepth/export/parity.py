@@ -1,0 +1,58 @@
+"""Whether an exported file predicts what its checkpoint does, on real images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hudepth.errors import CheckpointError
+from hudepth.inference.backends import Backend
+
+
+@dataclass(frozen=True)
+class Parity:
+    """How far an exported file is from its checkpoint."""
+
+    images: int
+    worst_mm: float
+    """Largest difference at any pixel."""
+    mean_mm: float
+
+    def __str__(self) -> str:
+        worst = f"at most {self.worst_mm:.3g} mm from the checkpoint"
+        return f"{worst} at any pixel of {self.images} images, {self.mean_mm:.2g} mm on average"
+
+
+def compare(
+    exported: Backend, reference: Backend, images: UInt8[np.ndarray, "n h w 3"], *, batch_size: int = 5
+) -> Parity:
+    """Predict the same images twice.
+
+    Args:
+        exported: the file, opened as a user would open it.
+        reference: the checkpoint.
+        images: RGB at the model's size.
+        batch_size: images at a time; more than one, so that the batch axis is tried, too.
+    """
+    worst, total = 0.0, 0.0
+    for at in range(0, len(images), batch_size):
+        batch = np.ascontiguousarray(images[at : at + batch_size])
+        difference = np.abs(exported(batch) - reference(batch)).astype(np.float64) * 1000
+        worst = max(worst, float(difference.max())) if np.isfinite(difference).all() else float("inf")
+        total += float(difference.mean(axis=(1, 2)).sum())
+    return Parity(len(images), worst, total / len(images))
+
+
+def check(parity: Parity, *, what: str, tolerance_mm: float) -> None:
+    """Refuse a file that is too far away.
+
+    Raises:
+        CheckpointError: if it is.
+    """
+    if not parity.worst_mm <= tolerance_mm:
+        raise CheckpointError(
+            f"{what}: {parity.worst_mm:.3g} mm from the checkpoint at the worst pixel, allowed are {tolerance_mm:g}. "
+            f"It is not kept; pass tolerance_mm={parity.worst_mm * 1.1:.2g} to keep it all the same."
+        )
