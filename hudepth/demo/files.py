@@ -1,0 +1,107 @@
+"""What a page keeps on disk while it runs: one temporary folder, and in it each session's last picture alone."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import tempfile
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from hudepth.data.sources.rooms import RoomsSource
+from hudepth.demo.answers import Answer
+from hudepth.inference.writing import FORMATS, Style
+
+EXAMPLE_ROOMS = (3, 1, 2, 0)
+"""Scenes of the built-in rooms: a living room, a kitchen, an office, a bedroom."""
+EXAMPLE_SIZE = (480, 640)
+DOWNLOADS = ("png16", "npy", "ply")
+"""Formats that can be downloaded, in the order of the buttons."""
+
+
+@dataclass
+class _Session:
+    upload: Path | None = None
+    results: Path | None = None
+
+
+class Files:
+    """The folder of a running page, gone with it; used as ``with Files() as files``."""
+
+    def __init__(self) -> None:
+        self._sessions: dict[str, _Session] = {}
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Files:
+        self.root = Path(tempfile.mkdtemp(prefix="hudepth-demo-")).resolve()
+        self.uploads, self.results, self.examples = (self.root / n for n in ("uploads", "results", "examples"))
+        for folder in (self.uploads, self.results, self.examples):
+            folder.mkdir()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        shutil.rmtree(self.root, ignore_errors=True)
+
+    def begin(self, session: str, upload: Path) -> None:
+        """Note what a session uploaded, and delete what it had before."""
+        uploaded = upload if upload.is_relative_to(self.uploads) else None  # an example stays
+        self._replace(session, _Session(uploaded))
+
+    def end(self, session: str) -> None:
+        """Delete all that belongs to a session and to no other."""
+        self._replace(session, None)
+
+    def _replace(self, session: str, now: _Session | None) -> None:
+        with self._lock:
+            before = self._sessions.pop(session, _Session())
+            if now is not None:
+                self._sessions[session] = now
+            kept = {each.upload for each in self._sessions.values()}  # a picture that was uploaded twice is one file
+            if before.upload is not None and before.upload not in kept:
+                before.upload.unlink(missing_ok=True)
+        if before.results is not None:
+            shutil.rmtree(before.results, ignore_errors=True)
+
+    def write(self, session: str, answer: Answer) -> list[Path]:
+        """Write a session's downloads, in the order of :data:`DOWNLOADS`, into a folder whose name nobody can guess.
+
+        PNG and npy have the picture's own size; the point cloud has the points that are shown.
+
+        Raises:
+            OSError: whatever the file system says.
+        """
+        folder = self.results / secrets.token_urlsafe(16)
+        folder.mkdir()
+        with self._lock:
+            self._sessions.setdefault(session, _Session()).results = folder
+        style = Style(scale_m=(0.0, answer.depth.max_depth_m), intrinsics=answer.camera)
+        paths = []
+        for name in DOWNLOADS:
+            ending, write = FORMATS[name]
+            paths.append(folder / f"{answer.name}{ending}")
+            with paths[-1].open("wb") as file:
+                write(answer.shown if name == "ply" else answer.depth, file, style)
+        return paths
+
+
+def draw_examples(folder: Path) -> list[Path]:
+    """Draw pictures of built-in rooms, a quarter of a second each.
+
+    Args:
+        folder: where to.
+    """
+    rooms = RoomsSource(scenes=max(EXAMPLE_ROOMS) + 2, frames_per_scene=1, size=EXAMPLE_SIZE)
+    records = rooms.records()
+    paths = []
+    for scene in EXAMPLE_ROOMS:
+        paths.append(folder / f"{records[scene].category}.jpg")
+        bgr = cv2.cvtColor(np.asarray(rooms.read(records[scene]).image, np.uint8), cv2.COLOR_RGB2BGR)
+        paths[-1].write_bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+    return paths

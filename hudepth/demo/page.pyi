@@ -1,0 +1,145 @@
+"""The page: gradio's picture, examples and downloads around a viewer of our own."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import gradio as gr
+from gradio.data_classes import ImageData
+
+from hudepth.console import log
+from hudepth.demo.answers import Answer, colour_table
+from hudepth.demo.files import Files
+from hudepth.errors import HudepthError
+from hudepth.inference.info import ModelInfo
+
+FONTS = ["ui-sans-serif", "system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "Arial", "sans-serif"]
+MONO = ["ui-monospace", "Menlo", "Consolas", "monospace"]
+"""Fonts that machines have; gradio's own themes would load others from elsewhere."""
+BUTTONS = ("PNG, 16 bit, mm", "npy, m", "PLY, points in m")
+KEEP_S = (600, 3600)
+"""How often files are looked through that no session claimed, and how old they may become [s]."""
+
+from gradio.events import Dependency
+
+class UndecodedImage(gr.Image):
+    """gr.Image that leaves the file alone: gradio would open it with every decoder that Pillow has."""
+
+    is_template = True  # so it looks like its parent
+
+    def preprocess(self, payload: ImageData | None) -> str | None:
+        """Return the path of the uploaded file."""
+        return None if payload is None else payload.path
+    from typing import Callable, Literal, Sequence, Any, TYPE_CHECKING
+    from gradio.blocks import Block
+    if TYPE_CHECKING:
+        from gradio.components import Timer
+        from gradio.components.base import Component
+
+def build(
+    compute: Callable[[Path], Answer], files: Files, examples: list[Path], *, info: ModelInfo, camera: str
+) -> gr.Blocks:
+    """Lay out the page.
+
+    Args:
+        compute: from an uploaded file to its depth; raises HudepthError with a line for the page.
+        files: where results go.
+        examples: pictures to offer.
+        info: of the model.
+        camera: in words, whose intrinsics the point cloud has.
+    """
+    gr.set_static_paths([files.examples, files.results])  # served where they lie, not copied
+    blocks: gr.Blocks = gr.Blocks(title="hudepth", analytics_enabled=False, delete_cache=KEEP_S, fill_width=True)
+    with blocks:
+        gr.HTML(headline(info, camera), elem_id="headline")
+        with gr.Row(equal_height=False):
+            with gr.Column(scale=2, min_width=300):
+                image = UndecodedImage(
+                    label="Picture", type="filepath", sources=["upload", "clipboard", "webcam"], height=280,
+                    buttons=["fullscreen"], alt_text="The picture you chose", elem_id="picture",
+                    webcam_options=gr.WebcamOptions(mirror=False, constraints={"video": {"facingMode": "environment"}}),
+                )  # fmt: skip
+                gr.Examples([[str(path)] for path in examples], [image], label="Examples: drawn rooms", elem_id="rooms")
+            with gr.Column(scale=5, min_width=320):
+                viewer = _viewer()
+                with gr.Row(elem_id="downloads"):
+                    buttons = [
+                        gr.DownloadButton(label, interactive=False, size="md", min_width=100) for label in BUTTONS
+                    ]
+        image.change(
+            handler(compute, files), [image], [viewer, *buttons],
+            show_progress="minimal", trigger_mode="always_last", api_visibility="private",
+        )  # fmt: skip
+        blocks.unload(_forget(files))
+    return blocks
+
+def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., Iterator[tuple[Any, ...]]]:
+    """Return what is called with each new picture: yields the viewer's value and the three buttons.
+
+    The depth is shown before the files are written, which takes longer for large pictures.
+    """
+    off = tuple(gr.DownloadButton(value=None, interactive=False) for _ in BUTTONS)
+
+    def show(upload: str | None, request: gr.Request) -> Iterator[tuple[Any, ...]]:
+        session = request.session_hash or ""
+        if upload is None:
+            files.end(session)
+            yield (None, *off)
+            return
+        files.begin(session, Path(upload))
+        try:
+            answer = compute(Path(upload))
+        except HudepthError as error:
+            yield ({"error": str(error)}, *off)
+            return
+        except MemoryError:
+            yield ({"error": "This machine has too little memory for the picture. Resize it."}, *off)
+            return
+        yield (answer.payload, *off)
+        try:
+            paths = files.write(session, answer)
+        except OSError as error:
+            log.warning("no files to download: %s", error)
+            return
+        yield (gr.skip(), *(gr.DownloadButton(value=str(path), interactive=True) for path in paths))
+
+    return show
+
+def _forget(files: Files) -> Callable[[gr.Request], None]:
+    def forget(request: gr.Request) -> None:
+        files.end(request.session_hash or "")
+
+    return forget
+
+def _viewer() -> gr.HTML:
+    return gr.HTML(
+        None,
+        html_template=data_file("viewer.html"),
+        js_on_load=data_file("points.js") + data_file("viewer.js"),
+        apply_default_css=False,
+        elem_id="viewer",
+        colours=base64.b64encode(colour_table().tobytes()).decode(),
+    )
+
+def headline(info: ModelInfo, camera: str) -> str:
+    """Return what stands above all: which model this is, and what its numbers are worth."""
+    source = escape(str(info.trained_on.get("source") or "unknown data"))
+    return (
+        '<div class="hd-head"><h1>Depth from one picture</h1><p>'
+        f"{escape(info.name)} of {info.parameters / 1e6:.2f} million parameters, trained on {source} for {info.epoch} "
+        f"epochs, tells 0 to {info.max_depth_m:g} m. Camera of the point cloud: {escape(camera)}. "
+        "Do not trust the metres of pictures unlike those it was trained on.</p></div>"
+    )
+
+def theme() -> gr.Theme:
+    """Return gradio's default look with fonts of the machine itself."""
+    return gr.themes.Default(primary_hue="blue", font=FONTS, font_mono=MONO)
+
+def data_file(name: str) -> str:
+    """Return the text of a file of this package."""
+    return resources.files("hudepth.demo").joinpath(name).read_text(encoding="utf-8")

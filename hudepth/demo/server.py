@@ -1,0 +1,145 @@
+"""Serves the page on this machine until Ctrl-C; nothing is sent to, or asked of, any other."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hudepth.demo.answers import Answer, Limits
+from hudepth.demo.files import Files, draw_examples
+from hudepth.errors import ConfigError
+from hudepth.inference.info import ModelInfo
+
+SILENCE = {
+    "GRADIO_ANALYTICS_ENABLED": "False",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+    "HF_HUB_OFFLINE": "1",
+    "DO_NOT_TRACK": "1",
+}
+"""What keeps gradio, and the libraries it brings, from calling home."""
+POLICY = (
+    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; object-src 'none'; form-action 'self'; frame-ancestors 'none'"
+)
+"""What browsers load for this page: nothing from other hosts. gradio's own parts need inline scripts and eval."""
+
+
+class Policy:
+    """ASGI middleware that adds :data:`POLICY` to each answer."""
+
+    def __init__(self, app: Any) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Pass a request on."""
+
+        async def send_with_policy(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                extra = [(b"content-security-policy", POLICY.encode()), (b"referrer-policy", b"no-referrer")]
+                message = {**message, "headers": [*message.get("headers", []), *extra]}
+            await send(message)
+
+        await self._app(scope, receive, send_with_policy if scope["type"] == "http" else send)
+
+
+def free_port(host: str, port: int) -> int:
+    """Return ``port``, or a free one for 0.
+
+    Raises:
+        ConfigError: if it is taken, or the host is none of this machine's addresses.
+    """
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as trial:
+            if os.name == "posix":  # elsewhere it would let two programs share a port
+                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind((host, port))
+            return int(trial.getsockname()[1])
+    except socket.gaierror:
+        raise ConfigError(f"host: no address '{host}'. Pass host=127.0.0.1, or 0.0.0.0 for all networks.") from None
+    except OSError as error:
+        raise ConfigError(
+            f"port: {host}:{port} cannot be had ({error.strerror}). Pass another port=, or port=0 for any that is free."
+        ) from None
+
+
+def serve(
+    compute: Callable[[Path], Answer],
+    *,
+    host: str,
+    port: int,
+    limits: Limits,
+    info: ModelInfo,
+    camera: str,
+    ready: Callable[[str], None],
+) -> None:
+    """Serve the page until the process is interrupted or terminated.
+
+    Args:
+        compute: from an uploaded file to its depth.
+        host: address to listen on.
+        port: to listen on; 0 takes a free one.
+        limits: what is refused.
+        info: of the model, for the page.
+        camera: whose intrinsics the point cloud has, for the page.
+        ready: called with the page's address once it answers.
+
+    Raises:
+        ConfigError: if the port is taken.
+    """
+    port = free_port(host, port)
+    with Files() as files, _ended_by_signals() as ended:
+        _silence(files.uploads)
+        from starlette.middleware import Middleware
+
+        from hudepth.demo import page
+
+        examples = draw_examples(files.examples)
+        blocks = page.build(compute, files, examples, info=info, camera=camera)
+        try:
+            _, address, _ = blocks.launch(
+                server_name=host, server_port=port, share=False, inbrowser=False, prevent_thread_lock=True, quiet=True,
+                show_error=True, max_file_size=limits.upload_bytes, ssr_mode=False, mcp_server=False, pwa=False,
+                enable_monitoring=False, run_history=False, footer_links=[], theme=page.theme(),
+                css=page.data_file("viewer.css"), app_kwargs={"middleware": [Middleware(Policy)]},
+            )  # fmt: skip
+            ready(address.rstrip("/"))
+            ended.wait()
+        finally:
+            blocks.close(verbose=False)
+
+
+def _silence(uploads: Path) -> None:
+    """Set what gradio reads when it is imported: where uploads go, and that it tells nobody of them."""
+    os.environ.update(SILENCE, GRADIO_TEMP_DIR=str(uploads))
+    for name in ("NO_PROXY", "no_proxy"):  # gradio asks its own page once, which no proxy could reach
+        os.environ[name] = ",".join(filter(None, [os.environ.get(name), "127.0.0.1", "localhost"]))
+    if (runtime := sys.modules.get("onnxruntime")) is not None and hasattr(runtime, "disable_telemetry_events"):
+        runtime.disable_telemetry_events()
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C and a termination set, so that what was begun is ended in order."""
+    ended = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield ended
+        return
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        ended.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield ended
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
