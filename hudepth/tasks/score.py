@@ -24,6 +24,7 @@ from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.scoring import image_table
 from hudepth.metrics.strata import strata_csv, summarise_strata
 from hudepth.metrics.summary import ImageTable, per_image_csv, summarise
+from hudepth.models.inference import inference_form
 from hudepth.results import MODEL
 from hudepth.tasks.common import build_protocols, without_known_warnings
 from hudepth.tasks.config import whole_number
@@ -57,7 +58,8 @@ def score_checkpoint(
         output.mkdir(parents=True, exist_ok=True)  # not after the work is done
     except OSError as error:
         raise ConfigError(f"output: cannot make '{output}' ({error.strerror}). Pass output=<a folder>.") from error
-    predictors: dict[str, nn.Module] = {MODEL: checkpoint.build_net(trust=config["trust"])}
+    net = checkpoint.build_net(trust=config["trust"])
+    predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
     if config.get("baselines", True):
         predictors |= trivial_baselines(datamodule.store, datamodule.split.train, max_depth_m=datamodule.max_depth_m)
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m, detailed=MODEL)

@@ -18,7 +18,7 @@ def shared(
     hydra = OmegaConf.create({"launcher": launcher, "job": {"num": number}})
     threads = [8]
     monkeypatch.setattr(job.HydraConfig, "get", lambda: hydra)
-    monkeypatch.setattr(job, "cores", lambda: 8)
+    monkeypatch.setattr(job, "usable_cores", lambda: 8)
     monkeypatch.setattr(torch, "set_num_threads", threads.append)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     cfg = OmegaConf.create({"trainer": {"accelerator": accelerator, "devices": 1}})
