@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import math
 import os
+import platform
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Where Linux says how much processor time a container gets: quota and period, or ``max``."""
+CPUINFO = Path("/proc/cpuinfo")
+INSTRUCTION_SETS = (
+    "avx2", "fma", "avx512f", "avx512_vnni", "avx_vnni", "avx512_bf16", "avx512_fp16", "amx_tile", "amx_bf16",
+    "amx_int8", "asimd", "asimddp", "sve", "bf16", "i8mm",
+)  # fmt: skip
+"""Of a processor's many, those that decide how fast networks run on it."""
+PACKAGES = ("torch", "onnxruntime", "openvino", "nncf", "transformers")
+"""What networks are run with, or made smaller by."""
 
 
 def usable_cores() -> int:
@@ -18,3 +29,40 @@ def usable_cores() -> int:
         return max(1, min(allowed, math.ceil(int(quota) / int(period))))
     except (OSError, ValueError):  # another system, or no limit
         return allowed
+
+
+def hardware() -> dict[str, Any]:
+    """Return what a reader of times needs to know of the machine and of what computes on it.
+
+    Returns:
+        ``processor``, ``cores``, ``usable_cores``, ``memory_gb`` (None where it is not known), ``instruction_sets``
+        (of :data:`INSTRUCTION_SETS`, as Linux names them), ``system``, ``python`` and ``packages`` (versions, None if
+        not installed).
+    """
+    lines = CPUINFO.read_text(encoding="utf-8").splitlines() if CPUINFO.is_file() else []
+    known = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    flags = known.get("flags", known.get("Features", "")).split()  # x86, ARM
+    return {
+        "processor": known.get("model name") or platform.processor() or platform.machine(),
+        "cores": os.cpu_count() or 1,
+        "usable_cores": usable_cores(),
+        "memory_gb": _memory_gb(),
+        "instruction_sets": [name for name in INSTRUCTION_SETS if name in flags],
+        "system": platform.platform(terse=True),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+    }
+
+
+def _memory_gb() -> float | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    except (AttributeError, ValueError, OSError):  # another system
+        return None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

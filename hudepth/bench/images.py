@@ -1,0 +1,39 @@
+"""What all contenders look at: a few pictures of built-in rooms."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from hudepth.data.resize import resize_image
+from hudepth.data.sources.rooms import RoomsSource
+from hudepth.files import written_whole
+from hudepth.normalise import NormaliseBytes
+
+COUNT = 8
+
+
+@cache
+def rooms() -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Return :data:`COUNT` pictures, each of another room."""
+    source = RoomsSource(scenes=COUNT, frames_per_scene=1)
+    return [source.read(record).image for record in source.records()]
+
+
+def images_file(folder: Path, size: tuple[int, int]) -> Path:
+    """Return a .npy file of the rooms at a size, normalised, float32 [n, 3, h, w]; it is written if it is not there.
+
+    Args:
+        folder: where.
+        size: (height, width).
+    """
+    path = folder / f"images_{size[0]}x{size[1]}.npy"
+    if not path.exists():
+        rgb = torch.from_numpy(np.stack([resize_image(image, size) for image in rooms()]))
+        with written_whole(path, durable=False) as part, part.open("wb") as file:
+            np.save(file, NormaliseBytes()(rgb).contiguous().numpy())
+    return path

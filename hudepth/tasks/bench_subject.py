@@ -1,0 +1,68 @@
+"""The network that hudepth-bench measures: that of a checkpoint, or a model with random weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from hudepth.bench.field import Subject
+from hudepth.bench.torch_runners import operations, parameters
+from hudepth.checkpoint import load_checkpoint
+from hudepth.errors import ConfigError
+from hudepth.inference.backends import EXPORTED, info_of
+from hudepth.instantiate import instantiate
+from hudepth.models.inference import inference_form
+
+USUAL_SIZE, USUAL_MAX_DEPTH_M = (224, 224), 10.0
+"""Of a model that no checkpoint says it of."""
+
+
+def make_subject(config: dict[str, Any], folder: Path) -> Subject:
+    """Return what is to be measured; its tensors are written to ``folder``.
+
+    Args:
+        config: of hudepth-bench.
+        folder: that exists.
+
+    Raises:
+        HudepthError: if there is no such checkpoint, or the network cannot be built or does not take the size.
+    """
+    size, trust = _size(config["size"]), [str(name) for name in config["trust"]]
+    spec, model = config["checkpoint"], config.get("model")
+    if (spec is None) == (model is None):
+        what = "both are set" if model is not None else "neither is set"
+        raise ConfigError(f"checkpoint, model: {what}. Pass checkpoint=<file | run directory | last> or model=<name>.")
+    if spec is not None:
+        if Path(str(spec)).suffix.lower() in EXPORTED:
+            raise ConfigError("checkpoint: exported files are made here. Pass the checkpoint or bundle it came from.")
+        checkpoint = load_checkpoint(str(spec), runs=config["paths"]["runs"])
+        net = checkpoint.build_net(trust=trust)
+        info = info_of(checkpoint, parameters=parameters(net), size=size)
+        model, size, max_depth_m = checkpoint.config["model"], info.size, info.max_depth_m
+    else:
+        torch.manual_seed(0)
+        net = instantiate(_without_weights(model), trust=trust, only=object if trust else nn.Module).eval()
+        size, max_depth_m = size or USUAL_SIZE, USUAL_MAX_DEPTH_M
+    state = folder / "state.pt"
+    torch.save(net.state_dict(), state)
+    return Subject(
+        name=type(net).__name__, model=_without_weights(model), trust=trust, state=state, size=size,
+        max_depth_m=max_depth_m, parameters=parameters(net), flops=operations(net, size),
+        merged_flops=operations(inference_form(net, size=size), size),
+    )  # fmt: skip
+
+
+def _without_weights(model: Any) -> dict[str, Any]:
+    """Return a model's configuration without what it starts from: its tensors are given."""
+    return {**model, **({"weights": None} if "weights" in model else {})}
+
+
+def _size(value: Any) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 2 or not all(type(side) is int and side > 0 for side in value):
+        raise ConfigError(f"size: {value} is not [height,width]. Pass size=[224,224].")
+    return value[0], value[1]
