@@ -6,13 +6,14 @@ import base64
 import io
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
+from numpy.typing import NDArray
 from PIL import Image
 
 from hudepth.data.resize import resize_image
@@ -20,7 +21,7 @@ from hudepth.data.sources.files import MAX_PIXELS
 from hudepth.data.store import to_mm
 from hudepth.errors import ConfigError, DataError
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.images import FORMATS
+from hudepth.inference.images import FORMATS, read_photo
 from hudepth.inference.model import DepthModel
 from hudepth.viz.colour import colour_depth
 from hudepth.viz.point_cloud import Intrinsics
@@ -70,7 +71,8 @@ def answer(path: Path, model: DepthModel, limits: Limits, intrinsics: Intrinsics
         DataError: with one line for whoever uploaded it.
     """
     start = time.perf_counter()
-    depth = model.predict(read_upload(path, limits))
+    photo = read_photo(read_upload(path, limits), where=f"'{path.name}'")
+    depth = replace(model.predict(photo.rgb), notes=photo.notes)
     shown = reduced(depth)
     (height, width), (rows, columns) = depth.metres.shape, shown.metres.shape
     camera = scaled(intrinsics or Intrinsics.of_nyu(height, width), columns / width, rows / height)
@@ -130,7 +132,7 @@ def reduced(depth: DepthMap, max_side: int = MAX_SIDE) -> DepthMap:
     return DepthMap(picked, resize_image(depth.image, (rows, columns)), depth.max_depth_m, depth.notes)
 
 
-def _centres(length: int, count: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+def _centres(length: int, count: int) -> NDArray[np.intp]:
     return ((np.arange(count) + 0.5) * (length / count)).astype(np.intp)
 
 
@@ -143,7 +145,7 @@ def scaled(camera: Intrinsics, x: float, y: float) -> Intrinsics:
 
 def colour_table() -> UInt8[np.ndarray, "256 3"]:
     """Return the colours of the depth scale, near first."""
-    steps: Float[np.ndarray, "1 256"] = np.arange(256, dtype=np.float32)[None]
+    steps = np.arange(256, dtype=np.float32)[None]
     steps[0, 0] = 1e-3  # 0 would be unmeasured
     return np.asarray(colour_depth(steps, scale_m=(0.0, 255.0), legend=False)[0])
 

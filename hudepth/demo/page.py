@@ -26,16 +26,6 @@ KEEP_S = (600, 3600)
 """How often files are looked through that no session claimed, and how old they may become [s]."""
 
 
-class UndecodedImage(gr.Image):
-    """gr.Image that leaves the file alone: gradio would open it with every decoder that Pillow has."""
-
-    is_template = True  # so it looks like its parent
-
-    def preprocess(self, payload: ImageData | None) -> str | None:
-        """Return the path of the uploaded file."""
-        return None if payload is None else payload.path
-
-
 def build(
     compute: Callable[[Path], Answer], files: Files, examples: list[Path], *, info: ModelInfo, camera: str
 ) -> gr.Blocks:
@@ -54,7 +44,7 @@ def build(
         gr.HTML(headline(info, camera), elem_id="headline")
         with gr.Row(equal_height=False):
             with gr.Column(scale=2, min_width=300):
-                image = UndecodedImage(
+                image = gr.Image(
                     label="Picture", type="filepath", sources=["upload", "clipboard", "webcam"], height=280,
                     buttons=["fullscreen"], alt_text="The picture you chose", elem_id="picture",
                     webcam_options=gr.WebcamOptions(mirror=False, constraints={"video": {"facingMode": "environment"}}),
@@ -66,12 +56,18 @@ def build(
                     buttons = [
                         gr.DownloadButton(label, interactive=False, size="md", min_width=100) for label in BUTTONS
                     ]
+        vars(image)["preprocess"] = path_of  # gradio's own opens the file, with every decoder that Pillow has
         image.change(
             handler(compute, files), [image], [viewer, *buttons],
             show_progress="minimal", trigger_mode="always_last", api_visibility="private",
         )  # fmt: skip
         blocks.unload(_forget(files))
     return blocks
+
+
+def path_of(payload: ImageData | None) -> str | None:
+    """Return the path of an uploaded file, which is left alone."""
+    return None if payload is None else payload.path
 
 
 def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., Iterator[tuple[Any, ...]]]:

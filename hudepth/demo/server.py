@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import gc
+import logging
 import os
 import signal
 import socket
@@ -23,6 +26,7 @@ SILENCE = {
     "HF_HUB_DISABLE_TELEMETRY": "1",
     "HF_HUB_OFFLINE": "1",
     "DO_NOT_TRACK": "1",
+    "FASTAPI_OTEL_AUTO_CONFIGURE": "false",
 }
 """What keeps gradio, and the libraries it brings, from calling home."""
 POLICY = (
@@ -96,6 +100,7 @@ def serve(
         ConfigError: if the port is taken.
     """
     port = free_port(host, port)
+    atexit.register(gc.freeze)  # or the interpreter looks for garbage in all of gradio once more: two seconds
     with Files() as files, _ended_by_signals() as ended:
         _silence(files.uploads)
         from starlette.middleware import Middleware
@@ -114,7 +119,15 @@ def serve(
             ready(address.rstrip("/"))
             ended.wait()
         finally:
-            blocks.close(verbose=False)
+            _close(blocks)
+
+
+def _close(blocks: Any) -> None:
+    """End the server at once: it would wait for open pages, and it complains of being cut short."""
+    logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
+    if blocks.server is not None:
+        blocks.server.force_exit = True
+    blocks.close(verbose=False)
 
 
 def _silence(uploads: Path) -> None:

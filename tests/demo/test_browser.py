@@ -1,0 +1,238 @@
+"""The installed script and a real browser: what a visitor sees, what leaves the machine, what stays behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from hudepth.data.store import to_mm
+from hudepth.inference.model import DepthModel
+
+from .conftest import HOSTILE, encoded
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SWITCHES = (
+    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update",
+)  # fmt: skip
+WATCH = """
+import os, sys
+def note(event, details):
+    if event in ("socket.connect", "socket.getaddrinfo"):
+        with open(os.environ["CALLS"], "a") as file:
+            file.write(f"{details[1] if event == 'socket.connect' else details[0]}\\n")
+sys.addaudithook(note)
+"""
+"""A sitecustomize.py: which addresses a process asks for."""
+HERE = re.compile(r"\('(127\.0\.0\.1|::1)', \d+.*\)|127\.0\.0\.1|localhost|None|/.*")
+
+
+@dataclass
+class Page:
+    """A running demo and where it keeps things."""
+
+    process: subprocess.Popen[str]
+    url: str
+    temporary: Path
+    calls: Path
+    asked: list[str] = field(default_factory=list)
+
+    def files(self) -> list[Path]:
+        """What sessions left on disk."""
+        (root,) = self.temporary.glob("hudepth-demo-*")
+        return [p for name in ("uploads", "results") for p in (root / name).rglob("*") if p.is_file()]
+
+
+@pytest.fixture(scope="module")
+def page(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium to open the page with")
+    folder = tmp_path_factory.mktemp("elsewhere")
+    (folder / "sitecustomize.py").write_text(WATCH)
+    (folder / "temporary").mkdir()
+    environment = {
+        **os.environ, "OMP_NUM_THREADS": "1", "TMPDIR": str(folder / "temporary"), "CALLS": str(folder / "calls"),
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")])),
+        "GRADIO_HEARTBEAT_INTERVAL": "0.5",
+    }  # fmt: skip
+    script = [str(Path(sys.executable).parent / "hudepth-demo"), f"checkpoint={checkpoint}", "port=0", "threads=1"]
+    process = subprocess.Popen(
+        [*script, "max_upload_mb=1"], cwd=folder, env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.fullmatch(r"model: TinyUNet, .*; open (http://127\.0\.0\.1:\d+) \(Ctrl-C ends\)\n", line)
+        assert found, line + process.stdout.read()
+        yield Page(process, found[1], folder / "temporary", folder / "calls")
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def browser(page: Page) -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=list(SWITCHES))
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, page: Page) -> Any:
+    tab = browser.new_page(viewport={"width": 1280, "height": 800})
+    tab.on("request", lambda request: page.asked.append(request.url))
+    tab.goto(page.url)
+    tab.wait_for_selector(".hd-empty")
+    return tab
+
+
+def send(tab: Any, name: str, data: bytes) -> None:
+    tab.set_input_files("#picture input[type=file]", {"name": name, "mimeType": "image/png", "buffer": data})
+
+
+def caption(tab: Any, name: str) -> None:
+    tab.locator(".hd-caption", has_text=name).wait_for(timeout=10_000)
+
+
+def until(condition: Callable[[], bool], seconds: float = 10) -> bool:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+PICTURE = encoded(96, 128)
+
+
+def test_the_depth_under_the_pointer_is_the_models(tab: Any, model: DepthModel) -> None:
+    send(tab, "a.png", PICTURE)
+    caption(tab, "a.png, 128 x 96")
+    expected = to_mm(model.predict(PICTURE).metres)
+    stage = tab.locator(".hd-stage")
+    box = stage.bounding_box()
+    for row, column in ((3, 100), (50, 20), (90, 120)):
+        x, y = (column + 0.5) / 128 * box["width"], (row + 0.5) / 96 * box["height"]
+        stage.hover(position={"x": x, "y": y})
+        assert tab.inner_text(".hd-reading") == f"{expected[row, column] / 1000 + 1e-9:.2f} m"
+    tab.mouse.move(1, 1)
+    assert not tab.is_visible(".hd-reading")
+
+
+def test_keys_move_the_reading_and_the_slider(tab: Any) -> None:
+    tab.focus(".hd-stage")
+    tab.keyboard.press("ArrowRight")
+    assert re.fullmatch(r"\d+\.\d\d m", tab.inner_text(".hd-reading"))
+    tab.focus(".hd-slider input")
+    tab.keyboard.press("ArrowLeft")
+    assert tab.evaluate("document.querySelector('.hd-line').style.left") == "49%"
+
+
+def test_the_scale_is_in_metres(tab: Any) -> None:
+    assert tab.locator(".hd-ticks span").all_inner_texts() == [f"{metres}.0 m" for metres in range(0, 11, 2)]
+    tab.check(".hd-own input")
+    assert tab.locator(".hd-ticks span").first.inner_text() != "0.0 m"
+    tab.uncheck(".hd-own input")
+
+
+def test_the_downloads_are_what_was_shown(tab: Any, model: DepthModel, tmp_path: Path) -> None:
+    for number, name in enumerate(("a_depth.png", "a_depth.npy", "a_depth.ply")):
+        with tab.expect_download() as download:
+            tab.locator("#downloads button").nth(number).click()
+        assert download.value.suggested_filename == name
+        download.value.save_as(tmp_path / name)
+    metres = np.load(tmp_path / "a_depth.npy")
+    np.testing.assert_allclose(metres, model.predict(PICTURE).metres, rtol=1e-5, atol=1e-6)
+    millimetres = cv2.imread(str(tmp_path / "a_depth.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(millimetres, to_mm(metres))
+    head, _, body = (tmp_path / "a_depth.ply").read_bytes().partition(b"end_header\n")
+    assert b"element vertex 12288" in head
+    np.testing.assert_array_equal(np.frombuffer(body, [("p", "<f4", 3), ("c", "u1", 3)])["p"][:, 2], metres.ravel())
+
+
+def test_the_points_are_drawn_and_turn(tab: Any) -> None:
+    tab.click("[data-mode=cloud]")
+    canvas = tab.locator(".hd-cloud")
+    tab.wait_for_timeout(300)
+    if "no WebGL" in tab.inner_text(".hd-hint"):
+        pytest.skip("this Chromium has no WebGL")
+    before = cv2.imdecode(np.frombuffer(canvas.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert before.std() > 20
+    canvas.press("ArrowLeft")
+    tab.wait_for_timeout(200)
+    after = cv2.imdecode(np.frombuffer(canvas.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert (before != after).mean() > 0.1
+    tab.click("[data-mode=map]")
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_strangers_file_is_a_message(tab: Any, name: str) -> None:
+    data, expected = HOSTILE[name]
+    send(tab, name, data)
+    tab.locator(".hd-message", has_text=expected).wait_for(timeout=10_000)
+    assert not tab.is_visible(".hd-result")
+
+
+def test_a_name_is_no_markup(tab: Any) -> None:
+    send(tab, "x<img src=x onerror=document.title=1>.png", b"text")
+    tab.locator(".hd-message", has_text="no image that can be read").wait_for()
+    assert tab.locator(".hd-message img").count() == 0
+    assert tab.locator("#headline b").count() == 0  # nor is what a checkpoint says of itself
+    assert tab.title() == "hudepth"
+
+
+def test_a_file_that_is_too_large_is_said_and_the_page_goes_on(tab: Any) -> None:
+    send(tab, "huge.png", bytes(2**20 + 1))
+    tab.get_by_text("exceeds the maximum").first.wait_for(timeout=10_000)
+    send(tab, "b.png", PICTURE)
+    caption(tab, "b.png, 128 x 96")
+    tab.locator("#rooms button").nth(1).click()
+    caption(tab, "kitchen.jpg, 640 x 480")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_nothing_is_wider_than_the_screen(tab: Any, width: int, height: int) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert tab.locator(".hd-stage").bounding_box()["width"] > 0.6 * min(width, height)
+
+
+def test_what_a_session_had_goes_with_it(tab: Any, page: Page) -> None:
+    send(tab, "c.png", PICTURE)
+    caption(tab, "c.png")
+    assert until(lambda: len(page.files()) == 4)  # the picture and three downloads
+    tab.close()
+    assert until(lambda: page.files() == [])
+
+
+def test_nothing_was_asked_of_other_hosts(page: Page) -> None:
+    assert len(page.asked) > 10
+    assert [url for url in page.asked if not url.startswith((page.url, "data:", "blob:"))] == []
+    calls = set(page.calls.read_text().splitlines())
+    assert [call for call in calls if not HERE.fullmatch(call)] == []
+
+
+def test_ctrl_c_ends_it_and_leaves_nothing(page: Page) -> None:
+    page.process.send_signal(signal.SIGINT)
+    out, _ = page.process.communicate(timeout=20)
+    assert page.process.returncode == 0
+    assert out == ""
+    assert list(page.temporary.glob("hudepth-demo-*")) == []

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hudepth.demo.answers import Answer, Limits, answer
+from hudepth.demo.files import Files
+from hudepth.errors import DataError
+from hudepth.inference.info import ModelInfo
+from hudepth.inference.model import DepthModel
+
+from .conftest import encoded
+
+gr = pytest.importorskip("gradio", reason="gradio is not installed")
+REQUEST: Any = gr.Request(session_hash="one")
+
+
+def buttons(update: tuple[Any, ...]) -> list[tuple[Any, bool]]:
+    return [(each["value"], each["interactive"]) for each in update[1:]]
+
+
+def test_the_depth_comes_before_the_files(model: DepthModel) -> None:
+    from hudepth.demo.page import handler
+
+    with Files() as files:
+        path = files.uploads / "a.png"
+        path.write_bytes(encoded(60, 80))
+        steps = handler(lambda upload: answer(upload, model, Limits(2**20, 10**6)), files)(str(path), REQUEST)
+        first = next(steps)
+        assert json.loads(json.dumps(first[0]))["width"] == 80
+        assert buttons(first) == [(None, False)] * 3
+        assert list(files.results.iterdir()) == []
+        second = next(steps)
+        assert [Path(value).suffix for value, there in buttons(second) if there] == [".png", ".npy", ".ply"]
+        assert next(steps, None) is None
+        (emptied,) = handler(lambda _: None, files)(None, REQUEST)  # type: ignore[arg-type,return-value]
+        assert emptied[0] is None
+        assert [p for p in files.root.rglob("*") if p.is_file()] == []
+
+
+@pytest.mark.parametrize(
+    ("error", "shown"), [(DataError("'<b>': no"), "'<b>': no"), (MemoryError(), "This machine has too little memory")]
+)
+def test_what_goes_wrong_is_for_the_page(error: Exception, shown: str) -> None:
+    from hudepth.demo.page import handler
+
+    def fails(_: Path) -> Answer:
+        raise error
+
+    with Files() as files:
+        (step,) = handler(fails, files)(str(files.uploads / "a.png"), REQUEST)
+    assert step[0]["error"].startswith(shown)
+    assert buttons(step) == [(None, False)] * 3
+
+
+def test_a_full_disk_costs_the_files_alone(model: DepthModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hudepth.demo.page import handler
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with Files() as files:
+        path = files.uploads / "a.png"
+        path.write_bytes(encoded(60, 80))
+        monkeypatch.setattr(files, "write", full)
+        (step,) = handler(lambda upload: answer(upload, model, Limits(2**20, 10**6)), files)(str(path), REQUEST)
+    assert step[0]["height"] == 60
+
+
+def test_the_headline_says_what_the_numbers_are_worth() -> None:
+    from hudepth.demo.page import headline
+
+    text = headline(ModelInfo("Net", (32, 48), 10.0, 4_650_000, 5, {"source": "<i>"}), "as given")
+    assert "Net of 4.65 million parameters, trained on &lt;i&gt; for 5 epochs, tells 0 to 10 m." in text
+    assert "Camera of the point cloud: as given." in text
+    assert "Do not trust" in text

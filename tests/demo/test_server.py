@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import Any
+
+import pytest
+
+from hudepth.demo.server import POLICY, Policy, free_port
+from hudepth.errors import ConfigError
+
+
+def test_a_port_that_is_taken_is_said_with_the_mend() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError) as caught:
+            free_port("127.0.0.1", port)
+    assert str(caught.value) == (
+        f"port: 127.0.0.1:{port} cannot be had (Address already in use). "
+        "Pass another port=, or port=0 for any that is free."
+    )
+
+
+def test_zero_is_any_port() -> None:
+    assert free_port("127.0.0.1", 0) > 0
+
+
+def test_a_host_must_be_an_address_of_this_machine() -> None:
+    with pytest.raises(ConfigError, match=r"port: 192\.0\.2\.1:80 cannot be had"):  # an address that nobody has
+        free_port("192.0.2.1", 80)
+
+
+def test_every_answer_carries_the_policy() -> None:
+    sent: list[Any] = []
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    asyncio.run(Policy(app)({"type": "http"}, None, send))
+    assert sent[0]["headers"][:2] == [(b"a", b"b"), (b"content-security-policy", POLICY.encode())]
+    assert "http" not in POLICY
