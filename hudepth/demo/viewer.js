@@ -162,6 +162,17 @@ function nameExamples(tries) {
   for (const each of pictures) each.alt = `Example: ${each.src.split("/").pop().split(".")[0].replace("_", " ")}`;
   if (!pictures.length && tries) setTimeout(() => nameExamples(tries - 1), 100);
 }
+// A picture pasted anywhere on the page goes where a chosen file would.
+document.addEventListener("paste", (event) => {
+  const input = document.querySelector("#picture input[type=file]");
+  const file = Array.from(event.clipboardData.files).find((each) => each.type.startsWith("image/"));
+  if (!input || !file) return;
+  const chosen = new DataTransfer();
+  chosen.items.add(file);
+  input.files = chosen.files;
+  input.dispatchEvent(new Event("change", { bubbles: true }));
+});
+
 nameExamples(50);
 split();
 watch("value", () => show(props.value));

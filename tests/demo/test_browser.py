@@ -121,6 +121,11 @@ def until(condition: Callable[[], bool], seconds: float = 10) -> bool:
 
 
 PICTURE = encoded(96, 128)
+PASTE = """data => {
+    const held = new DataTransfer();
+    held.items.add(new File([Uint8Array.from(data)], "pasted.png", { type: "image/png" }));
+    document.body.dispatchEvent(new ClipboardEvent("paste", { clipboardData: held, bubbles: true }));
+}"""
 
 
 def test_the_depth_under_the_pointer_is_the_models(tab: Any, model: DepthModel) -> None:
@@ -183,6 +188,11 @@ def test_the_points_are_drawn_and_turn(tab: Any) -> None:
     tab.click("[data-mode=map]")
 
 
+def test_a_picture_can_be_pasted(tab: Any) -> None:
+    tab.evaluate(PASTE, list(PICTURE))
+    caption(tab, "pasted.png, 128 x 96")
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_strangers_file_is_a_message(tab: Any, name: str) -> None:
     data, expected = HOSTILE[name]
@@ -201,7 +211,9 @@ def test_a_name_is_no_markup(tab: Any) -> None:
 
 def test_a_file_that_is_too_large_is_said_and_the_page_goes_on(tab: Any) -> None:
     send(tab, "huge.png", bytes(2**20 + 1))
-    tab.get_by_text("exceeds the maximum").first.wait_for(timeout=10_000)
+    tab.get_by_text("exceed the maximum allowed size").first.wait_for(timeout=10_000)
+    tab.get_by_text("Drop Image Here").wait_for()
+    tab.wait_for_timeout(300)
     send(tab, "b.png", PICTURE)
     caption(tab, "b.png, 128 x 96")
     tab.locator("#rooms button").nth(1).click()
