@@ -21,7 +21,7 @@ from hudepth.inference.info import ModelInfo
 FONTS = ["ui-sans-serif", "system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "Arial", "sans-serif"]
 MONO = ["ui-monospace", "Menlo", "Consolas", "monospace"]
 """Fonts that machines have; gradio's own themes would load others from elsewhere."""
-BUTTONS = ("PNG, 16 bit, mm", "npy, m", "PLY, points in m")
+BUTTONS = ("PNG16 (mm)", "npy (m)", "PLY (m)")
 KEEP_S = (600, 3600)
 """How often files are looked through that no session claimed, and how old they may become [s]."""
 
@@ -54,7 +54,7 @@ def build(
                 viewer = _viewer()
                 with gr.Row(elem_id="downloads"):
                     buttons = [
-                        gr.DownloadButton(label, interactive=False, size="md", min_width=100) for label in BUTTONS
+                        gr.DownloadButton(label, interactive=False, size="md", min_width=80) for label in BUTTONS
                     ]
         vars(image)["preprocess"] = path_of  # gradio's own opens the file, with every decoder that Pillow has
         image.change(

@@ -15,10 +15,13 @@ function show(value) {
   find(".hd-result").hidden = !result;
   shown = null;
   hideReading();
-  if (value && element.getBoundingClientRect().top > 0.6 * window.innerHeight) {
+  if (result) showResult(result);
+  if (value && element.getBoundingClientRect().top > 0.5 * window.innerHeight) {
     element.scrollIntoView({ block: "start" }); // on a phone it lies below the examples
   }
-  if (!result) return;
+}
+
+function showResult(result) {
   shown = { ...result, depth: new Uint16Array(bytesOf(result.depth_mm).buffer) };
   photo.src = result.photo;
   find(".hd-caption").textContent = result.caption;
