@@ -72,7 +72,7 @@ def page(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     }  # fmt: skip
     script = [str(Path(sys.executable).parent / "hudepth-demo"), f"checkpoint={checkpoint}", "port=0", "threads=1"]
     process = subprocess.Popen(
-        [*script, "max_upload_mb=1"], cwd=folder, env=environment, text=True,
+        [*script, "max_upload_mb=0.1"], cwd=folder, env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     try:
@@ -210,7 +210,7 @@ def test_a_name_is_no_markup(tab: Any) -> None:
 
 
 def test_a_file_that_is_too_large_is_said_and_the_page_goes_on(tab: Any) -> None:
-    send(tab, "huge.png", bytes(2**20 + 1))
+    send(tab, "huge.png", bytes(2**17))
     tab.get_by_text("exceed the maximum allowed size").first.wait_for(timeout=10_000)
     tab.get_by_text("Drop Image Here").wait_for()
     tab.wait_for_timeout(300)
