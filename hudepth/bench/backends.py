@@ -12,6 +12,7 @@ from hudepth.errors import ConfigError, did_you_mean
 REFERENCE = "eager"
 """Always measured: ratios and differences are to it."""
 _TORCH, _GRAPH = "hudepth.bench.torch_runners", "hudepth.bench.graph_runners"
+ONNX, INT8 = "model.onnx", "int8.xml"
 
 
 @dataclass(frozen=True)
@@ -38,23 +39,23 @@ BACKENDS = {
     "compile": Backend(f"{_TORCH}:compiled", "the merged form through torch.compile, for each batch size by itself"),
     "onnxruntime": Backend(
         f"{_GRAPH}:OnnxRunner", "the merged form, exported to ONNX",
-        packages=("onnxruntime", "onnx", "onnxscript"), extras="onnx", graph="model.onnx",
+        packages=("onnxruntime", "onnx", "onnxscript"), extras="onnx", graph=ONNX,
     ),
     "openvino": Backend(
         f"{_GRAPH}:OpenVinoRunner", "the same file in OpenVINO, in float32",
-        packages=_OPENVINO, extras="onnx,openvino", graph="model.onnx", options={"precision": "f32"},
+        packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "f32"},
     ),
     "openvino_bf16": Backend(
         f"{_GRAPH}:OpenVinoRunner", "the same file in OpenVINO, in bfloat16: not exact",
-        packages=_OPENVINO, extras="onnx,openvino", graph="model.onnx", options={"precision": "bf16"},
+        packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "bf16"},
     ),
     "int8": Backend(
         f"{_GRAPH}:OpenVinoRunner", "OpenVINO, quantised on a handful of built-in rooms: for its speed, not its depth",
-        packages=(*_OPENVINO, "nncf"), extras="onnx,openvino", graph="int8.xml", options={"precision": "f32"},
+        packages=(*_OPENVINO, "nncf"), extras="onnx,openvino", graph=INT8, options={"precision": "f32"},
     ),
 }  # fmt: skip
 """By name, in the table's order."""
-GRAPHS = {"model.onnx": "hudepth.bench.graphs:onnx", "int8.xml": "hudepth.bench.graphs:int8"}
+GRAPHS = {ONNX: "hudepth.bench.graphs:onnx", INT8: "hudepth.bench.graphs:int8"}
 """Files that backends read, and what makes each."""
 PRODUCT = f"{_TORCH}:product"
 """What measures the machine."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from hudepth.bench.backends import BACKENDS, GRAPHS, PRODUCT, missing
+from hudepth.bench.backends import BACKENDS, GRAPHS, ONNX, PRODUCT, missing
 from hudepth.bench.images import images_file
-from hudepth.bench.rows import Entry
+from hudepth.bench.rows import Entry, spelt
 from hudepth.bench.worker import ContenderError, Spec, Worker
 
 
@@ -53,7 +53,7 @@ class Field:
     workers: list[Worker] = field(default_factory=list)
 
     def __enter__(self) -> Field:
-        self._stack = ExitStack()
+        self._stack, self._started = ExitStack(), list[tuple[Worker, Entry]]()
         return self
 
     def __exit__(
@@ -61,42 +61,37 @@ class Field:
     ) -> None:
         self._stack.close()
 
-    def enter_backend(self, name: str) -> None:
-        """Add a backend; one that is not installed or cannot be built is a note.
+    def enter(self, backends: Sequence[str], peers: Sequence[str] = ()) -> int:
+        """Start all processes, which import side by side; what is not installed is a note.
 
         Args:
-            name: of :data:`hudepth.bench.backends.BACKENDS`.
+            backends: of :data:`hudepth.bench.backends.BACKENDS`.
+            peers: of :data:`hudepth.bench.peers.PEERS`, each at the size nearest to this network's and at its own.
+
+        Returns:
+            How many :meth:`build` builds.
         """
-        backend = BACKENDS[name]
-        if not self._is_here(name, backend.packages, backend.extras):
-            return
-        options = {**self._of_network(), **backend.options}
-        if backend.graph is not None:
+        for name in backends:
+            if self._is_here(name, BACKENDS[name].packages, BACKENDS[name].extras):
+                self._start_backend(name)
+        for label in peers:
+            self._start_peer(label)
+        return len(self._started)
+
+    def build(self) -> Iterator[None]:
+        """Build one after the other; yield after each. What cannot be built is a note."""
+        for worker, entry in self._started:
             try:
-                options["graph"] = str(self._graph(backend.graph))
+                graph = BACKENDS[entry.name].graph if not entry.peer else None
+                if graph is not None:
+                    self._make(graph)
+                described = worker.build()
             except ContenderError as error:
-                self.note(name, f"left out, since its graph cannot be made: {error}")
-                return
-        subject = self.subject
-        entry = Entry(name, name, subject.size, False, subject.parameters, subject.flops)
-        self._enter(Spec(name, backend.factory, self._images(), self.threads, options), entry)
-
-    def enter_peer(self, label: str) -> None:
-        """Add another network, at the size nearest to this one's and at its own.
-
-        Args:
-            label: of :data:`hudepth.bench.peers.PEERS`.
-        """
-        from hudepth.bench.peers import PEERS
-
-        peer = PEERS[label]
-        if not self._is_here(label, (peer.package,) if peer.package else (), "peers"):
-            return
-        for size in dict.fromkeys((peer.nearest(self.subject.size), peer.native)):
-            name = f"{label}, {size[0]} x {size[1]}"
-            options = {"peer": label, "size": size, "device": self.device}
-            spec = Spec(name, "hudepth.bench.peers:PeerRunner", self._images(size), self.threads, options)
-            self._enter(spec, Entry(name, label, size, True, None, None))
+                worker.close()
+                self.note(entry.name, f"cannot be built: {error}")
+            else:
+                self._take(worker, entry, described)
+            yield
 
     def product(self) -> Worker:
         """Return a process that multiplies matrices, which is no contender.
@@ -109,31 +104,51 @@ class Field:
         worker.build()
         return worker
 
-    def _enter(self, spec: Spec, entry: Entry) -> None:
-        worker = self._stack.enter_context(self._worker(spec))
-        try:
-            described = worker.build()
-        except ContenderError as error:
-            worker.close()
-            self.note(entry.name, f"cannot be built: {error}")
+    def _start_backend(self, name: str) -> None:
+        backend, subject = BACKENDS[name], self.subject
+        options = {**self._of_network(), **backend.options}
+        if backend.graph is not None:
+            options["graph"] = str(self.folder / backend.graph)
+        entry = Entry(name, name, subject.size, False, subject.parameters, subject.flops)
+        self._start(Spec(name, backend.factory, self._images(), self.threads, options), entry)
+
+    def _start_peer(self, label: str) -> None:
+        from hudepth.bench.peers import PEERS
+
+        peer = PEERS[label]
+        if not self._is_here(label, (peer.package,) if peer.package else (), "peers"):
             return
+        for size in dict.fromkeys((peer.nearest(self.subject.size), peer.native)):
+            name = f"{label}, {spelt(size)}"
+            options = {"peer": label, "size": size, "device": self.device}
+            spec = Spec(name, "hudepth.bench.peers:PeerRunner", self._images(size), self.threads, options)
+            self._start(spec, Entry(name, label, size, True, None, None))
+
+    def _start(self, spec: Spec, entry: Entry) -> None:
+        self._started.append((self._stack.enter_context(self._worker(spec)), entry))
+
+    def _take(self, worker: Worker, entry: Entry, described: dict[str, Any]) -> None:
         if entry.peer:
             entry = replace(entry, parameters=described["parameters"], flops=described["flops"])
             self.note(entry.name, f"random weights, eager, {described['layout']}")
         self.workers.append(worker)
         self.entries.append(entry)
 
-    def _graph(self, name: str) -> Path:
-        """Return a graph's file; it is made if it is not there."""
-        path = self.folder / name
+    def _make(self, graph: str) -> Path:
+        """Return a graph's file; it is made if it is not there.
+
+        Raises:
+            ContenderError: if it cannot be made.
+        """
+        path = self.folder / graph
         if not path.exists():
             options = {
                 **self._of_network(), "graph": str(path), "name": self.subject.name,
                 "max_depth_m": self.subject.max_depth_m,
             }  # fmt: skip
-            if name != "model.onnx":
-                options["onnx"] = str(self._graph("model.onnx"))
-            with self._worker(Spec(name, GRAPHS[name], self._images(), self.threads, options)) as maker:
+            if graph != ONNX:
+                options["onnx"] = str(self._make(ONNX))
+            with self._worker(Spec(graph, GRAPHS[graph], self._images(), self.threads, options)) as maker:
                 maker.build()
         return path
 

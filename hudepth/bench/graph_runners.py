@@ -12,7 +12,10 @@ from hudepth.bench.worker import Spec
 
 
 class OnnxRunner:
-    """ONNX Runtime on the CPU.
+    """ONNX Runtime on the CPU, with the options that predicting uses.
+
+    Its threads wait actively for some 20 ms after a pass, which the untimed pass of the next contender takes the brunt
+    of; without that a pass is slower.
 
     Args:
         spec: with the option ``graph``, an ONNX file.

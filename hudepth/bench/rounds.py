@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hudepth.bench.worker import Begun, ContenderError
 
 
+@runtime_checkable
 class Contender(Protocol):
     """What is measured; see :class:`hudepth.bench.worker.Worker`, whose commands these are."""
 
@@ -59,7 +60,10 @@ class Session:
     """Of timed passes in a turn."""
     longest_pass_s: float
     """A batch whose pass would take longer is left out."""
-    before_batch: Callable[[], None] = lambda: None
+    only: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    """Contenders that are measured at some of the batch sizes alone, and at which."""
+    before_round: Callable[[], None] = lambda: None
+    """What is measured of the machine as often as the contenders are."""
     samples: list[Sample] = field(default_factory=list)
     notes: dict[str, list[str]] = field(default_factory=dict)
     """By contender."""
@@ -80,13 +84,13 @@ class Session:
     def run(self) -> Iterator[None]:
         """Measure; yield after each step."""
         for batch in self.batches:
-            self.before_batch()
             here: dict[str, Sample] = {}
             for contender in list(self._left):
                 if self._fits(contender, batch):
                     self._begin(contender, batch, here)
                 yield
             for number in range(self.repeats):
+                self.before_round()
                 # forth and back: a steady drift then adds the same to each
                 for contender in self._left[:: -1 if number % 2 else 1]:
                     if contender.name in here:
@@ -102,6 +106,8 @@ class Session:
         self.notes.setdefault(name, []).append(line)
 
     def _fits(self, contender: Contender, batch: int) -> bool:
+        if batch not in self.only.get(contender.name, [batch]):
+            return False
         before = [sample for sample in self.samples if sample.name == contender.name]
         if not before:
             return True

@@ -127,7 +127,7 @@ def efficiency(rows: Iterable[Row], *, peak_gflop_per_s: float | None, merged_fl
     exact = [row for row in rows if row.batch == 1 and row.exact and row.gflop_per_s and row.share_of_peak]
     if not exact or peak_gflop_per_s is None:
         return ""
-    best = max(exact, key=lambda row: row.images_per_s)
+    best = max(exact, key=_speed)
     assert best.gflop_per_s is not None
     assert best.share_of_peak is not None
     merged = ""
@@ -142,45 +142,53 @@ def efficiency(rows: Iterable[Row], *, peak_gflop_per_s: float | None, merged_fl
     )
 
 
+def beside_peers(rows: Sequence[Row]) -> list[Row]:
+    """Return the peers and, at the same batch size, this model as it would be used; empty if there are no peers.
+
+    The batch is the smallest at which both were measured.
+    """
+    both = {row.batch for row in rows if row.kind == "peer"} & {row.batch for row in rows if row.contender == REFERENCE}
+    here = [row for row in rows if both and row.batch == min(both)]
+    exact = [row for row in here if row.exact]
+    shown = {REFERENCE, "default", *(max(exact, key=_speed).contender for _ in exact[:1])}
+    return [row for row in here if row.kind == "peer" or row.contender in shown]
+
+
 def comparisons(rows: Sequence[Row], *, size: tuple[int, int]) -> list[str]:
-    """Say how fast each peer is beside this model in PyTorch, at the smallest batch; then which of them are faster."""
-    batch = min((row.batch for row in rows), default=1)
-    here = [row for row in rows if row.batch == batch]
-    ours = {row.contender: row for row in here if row.kind == "backend"}
-    peers = [row for row in here if row.kind == "peer"]
-    if not peers or REFERENCE not in ours:
+    """Say how fast each peer is beside this model in PyTorch, then which of them are faster than what."""
+    here = beside_peers(rows)
+    if not here:
         return []
-    lines = []
+    peers = [row for row in here if row.kind == "peer"]
+    ours = [row for row in here if row.kind == "backend"]
+    in_torch = [row for row in ours if row.contender in (REFERENCE, "default")]
+    lines = [f"Images/s at batch {here[0].batch} over those of this model at {spelt(size)}:"]
+    near = []
     for name in dict.fromkeys(row.contender for row in peers):
         own = [row for row in peers if row.contender == name]
-        lines.append(f"{name} (random weights, eager): {'; '.join(_beside(row, ours) for row in own)}.")
-    near = [row for row in peers if (row.height, row.width) == min(_sizes(peers, row), key=lambda s: _far(s, size))]
-    lines.append(_faster(near, ours))
-    return [f"At batch {batch}, images/s in PyTorch beside this model at {size[0]} x {size[1]}.", *lines]
+        lines.append(f"{name} (random weights, eager): {'; '.join(_beside(row, in_torch) for row in own)}.")
+        near.append(min(own, key=lambda row: abs(row.height * row.width - size[0] * size[1])))
+    faster = [_faster(near, own) for own in ours]
+    return [*lines, f"Of the peers, at the size nearest to this model's: {'; '.join(faster)}."]
 
 
-def _sizes(peers: Iterable[Row], row: Row) -> list[tuple[int, int]]:
-    return [(other.height, other.width) for other in peers if other.contender == row.contender]
+def spelt(size: tuple[int, int]) -> str:
+    """Spell (height, width)."""
+    return str(size[0]) if size[0] == size[1] else f"{size[0]} x {size[1]}"
 
 
-def _far(size: tuple[int, int], wanted: tuple[int, int]) -> int:
-    return abs(size[0] * size[1] - wanted[0] * wanted[1])
+def _speed(row: Row) -> float:
+    return row.images_per_s if row.times_eager is None else row.times_eager  # the latter is blind to drifts
 
 
-def _beside(row: Row, ours: dict[str, Row]) -> str:
-    shown = [name for name in (REFERENCE, "default") if name in ours]
-    ratios = [f"{row.images_per_s / ours[name].images_per_s:.2f} x {name}" for name in shown]
-    return f"at {row.height} x {row.width} {' and '.join(ratios)}"
+def _beside(row: Row, ours: Sequence[Row]) -> str:
+    ratios = [f"{_speed(row) / _speed(own):.2f} x {own.contender}" for own in ours]
+    return f"at {spelt((row.height, row.width))} {' and '.join(ratios)}"
 
 
-def _faster(peers: Sequence[Row], ours: dict[str, Row]) -> str:
-    best = max((row for row in ours.values() if row.exact), key=lambda row: row.images_per_s)
-    parts = []
-    for name in dict.fromkeys((REFERENCE, "default", best.contender)):
-        if name in ours:
-            faster = [row.contender for row in peers if row.images_per_s > ours[name].images_per_s]
-            parts.append(f"than this model in {name}: {', '.join(faster) or 'none'}")
-    return f"Faster at the size nearest to its own, {'; '.join(parts)}."
+def _faster(peers: Sequence[Row], own: Row) -> str:
+    names = [row.contender for row in peers if _speed(row) > _speed(own)]
+    return f"{' and '.join(names) or 'none'} {'are' if len(names) > 1 else 'is'} faster than {own.contender}"
 
 
 def plain(row: Row) -> dict[str, Any]:

@@ -9,17 +9,17 @@ from typing import Any
 
 from rich.table import Table
 
-from hudepth.bench.rows import Row, plain
+from hudepth.bench.rows import Row, plain, spelt
 
 COLUMNS: tuple[tuple[str, Callable[[Row], str]], ...] = (
-    ("ms/image", lambda row: _figure(row.ms_per_image)),
-    ("images/s", lambda row: _figure(row.images_per_s)),
+    ("ms/image", lambda row: figure_text(row.ms_per_image)),
+    ("images/s", lambda row: figure_text(row.images_per_s)),
     ("x eager", lambda row: "" if row.times_eager is None else f"{row.times_eager:.2f}"),
-    ("p50 [ms]", lambda row: _figure(row.p50_ms)),
-    ("p25-p75", lambda row: f"{_figure(row.p25_ms)}-{_figure(row.p75_ms)}"),
-    ("p95", lambda row: _figure(row.p95_ms)),
+    ("p50 [ms]", lambda row: figure_text(row.p50_ms)),
+    ("p25-p75", lambda row: f"{figure_text(row.p25_ms)}-{figure_text(row.p75_ms)}"),
+    ("p95", lambda row: figure_text(row.p95_ms)),
     ("MB", lambda row: f"{row.peak_mb:.0f}"),
-    ("GFLOP/s", lambda row: "" if row.gflop_per_s is None else _figure(row.gflop_per_s)),
+    ("GFLOP/s", lambda row: "" if row.gflop_per_s is None else figure_text(row.gflop_per_s)),
     ("% peak", lambda row: "" if row.share_of_peak is None else f"{100 * row.share_of_peak:.0f}"),
     ("diff [mm]", lambda row: "" if row.difference_mm is None else f"{row.difference_mm:.2g}"),
 )
@@ -28,8 +28,8 @@ LEGEND = (
     "ms/image and images/s are those of the median pass; p50, p25-p75 and p95 are quantiles of a pass [ms]; x eager is "
     "images/s over those of this model in eager mode, the median over rounds in which both ran; MB is the most memory "
     "the process held, libraries included; GFLOP/s and % peak count the operations of the network as it was trained "
-    "(nominal), % peak of a single-precision matrix product measured in the same run; diff is the largest difference "
-    "from eager at any pixel."
+    "(nominal), % peak of the best single-precision matrix product of the same run, a yardstick and no bound, since "
+    "operations that merging saves are counted; diff is the largest difference from eager at any pixel."
 )
 
 
@@ -50,7 +50,7 @@ def terminal_table(rows: Sequence[Row], *, title: str) -> Table:
 
 def label(row: Row) -> str:
     """Return what a row is called: peers have more than one size."""
-    return row.contender if row.kind == "backend" else f"{row.contender}, {row.height} x {row.width}"
+    return row.contender if row.kind == "backend" else f"{row.contender}, {spelt((row.height, row.width))}"
 
 
 def markdown(
@@ -86,6 +86,6 @@ def csv_text(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def _figure(value: float) -> str:
-    """Return three digits or all whole ones."""
+def figure_text(value: float) -> str:
+    """Return a positive number with three digits, or all its whole ones."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"

@@ -17,7 +17,7 @@ from hudepth.instantiate import instantiate
 from hudepth.models.inference import inference_form
 from hudepth.paper.cost import counted_flops
 
-MATRIX, PRODUCTS = 2048, 5
+MATRIX, PRODUCTS = 2048, 3
 """Side of the matrices whose product is the machine's measure, and how many products are timed."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ class Plan:
     backends: list[str]
     batches: list[int]
     peers: bool
+    peer_batches: list[int]
     repeats: int
     seconds: float
     longest_pass: float
@@ -70,24 +71,27 @@ def bench(cfg: DictConfig) -> None:
 
 
 def _measure(plan: Plan, subject: Subject, folder: Path) -> tuple[Session, list[Row], list[float]]:
-    """Build all contenders, then go round; the rates are those of matrix products, one a batch size."""
+    """Build all contenders, then go round; the rates are those of matrix products, one a round."""
     session = Session([], plan.batches, plan.repeats, plan.seconds, plan.longest_pass)
     rates: list[float] = []
     with Field(subject, folder, plan.threads, plan.device, session.note) as field:
-        for name in track(plan.backends, total=len(plan.backends), what="building"):
-            field.enter_backend(name)
-        if plan.peers:
-            from hudepth.bench.peers import PEERS
-
-            for label in track(PEERS, total=len(PEERS), what="building peers"):
-                field.enter_peer(label)
+        count = field.enter(plan.backends, _peers() if plan.peers else ())
+        for _ in track(field.build(), total=count, what="building"):
+            pass
         session.enter(field.workers)
-        session.before_batch = _product(field, session, rates)
+        session.only = {entry.name: plan.peer_batches for entry in field.entries if entry.peer}
+        session.before_round = _product(field, session, rates)
         for _ in track(session.run(), total=session.steps, what="measuring"):
             pass
         entries = field.entries
     peak = max(rates, default=None)
     return session, make_rows(session.samples, entries, peak_gflop_per_s=peak, max_depth_m=subject.max_depth_m), rates
+
+
+def _peers() -> Sequence[str]:
+    from hudepth.bench.peers import PEERS
+
+    return list(PEERS)
 
 
 def _product(field: Field, session: Session, rates: list[float]) -> Callable[[], None]:
@@ -127,7 +131,7 @@ def _write(
         "machine": machine,
         "model": {**model, "trained": trained},
         "settings": {key: value for key, value in asdict(plan).items() if key != "output"},
-        "matmul_gflop_per_s": {"best": peak, "of_each_batch": rates},
+        "matmul_gflop_per_s": {"best": peak, "of_each_round": rates},
         "rows": [plain(row) for row in rows],
         "sentences": sentences,
         "notes": notes,
@@ -176,6 +180,7 @@ def _plan(config: dict[str, Any]) -> Plan:
         backends=check_backends(config["backends"]),
         batches=_batches(config["batches"]),
         peers=bool(config["peers"]),
+        peer_batches=_peer_batches(config),
         repeats=whole_number(config, "repeats", default=5, least=1),
         seconds=_seconds(config, "seconds", default=1, zero=True),
         longest_pass=_seconds(config, "longest_pass", default=10, zero=False),
@@ -185,11 +190,21 @@ def _plan(config: dict[str, Any]) -> Plan:
     )
 
 
-def _batches(value: Any) -> list[int]:
+def _batches(value: Any, *, key: str = "batches") -> list[int]:
     batches = value if isinstance(value, list) else [value]
     if not batches or not all(type(batch) is int and batch > 0 for batch in batches):
-        raise ConfigError(f"batches: {value} is no list of positive whole numbers. Pass batches=[1,4,8,16,32].")
+        raise ConfigError(f"{key}: {value} is no list of positive whole numbers. Pass {key}=[1,4].")
     return sorted(set(batches))
+
+
+def _peer_batches(config: dict[str, Any]) -> list[int]:
+    batches, wanted = _batches(config["batches"]), _batches(config["peer_batches"], key="peer_batches")
+    chosen = [batch for batch in wanted if batch in batches]
+    if config["peers"] and not chosen:
+        raise ConfigError(
+            f"peer_batches: none of {wanted} is among batches={batches}. Pass peer_batches=[{batches[0]}]."
+        )
+    return chosen
 
 
 def _seconds(config: dict[str, Any], key: str, *, default: float, zero: bool) -> float:

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from hudepth.bench.images import COUNT, images_file
+from hudepth.bench.torch_runners import TorchRunner, channels_last, default, eager, operations, product
+from hudepth.bench.worker import Spec
+from hudepth.models.hybrid_unet import HybridUNet
+from hudepth.models.inference import inference_form
+from hudepth.paper.cost import counted_flops
+
+
+@pytest.fixture(scope="module")
+def net() -> nn.Module:
+    torch.manual_seed(0)
+    return HybridUNet().eval()
+
+
+@pytest.fixture(scope="module")
+def spec(net: nn.Module, tmp_path_factory: pytest.TempPathFactory) -> Spec:
+    folder = tmp_path_factory.mktemp("bench")
+    torch.save(net.state_dict(), folder / "state.pt")
+    model = {"_target_": "hudepth.models.hybrid_unet.HybridUNet"}
+    options = {"model": model, "trust": [], "state": str(folder / "state.pt"), "size": (64, 64), "device": "cpu"}
+    return Spec("any", "", images_file(folder, (64, 64)), 1, options)
+
+
+def test_all_forms_give_what_the_network_gives(spec: Spec, net: nn.Module) -> None:
+    images = np.load(spec.images)
+    assert images.shape == (COUNT, 3, 64, 64)
+    assert np.abs(images).max() < 3
+    with torch.inference_mode():
+        expected = net(torch.from_numpy(images[:2])).numpy()
+    runners: list[TorchRunner] = [eager(spec), channels_last(spec), default(spec)]
+    for runner in runners:
+        runner.load(images[:2])
+        runner.run()
+        np.testing.assert_allclose(runner.result(), expected, atol=1e-5)
+        assert runner.describe() == {}
+        assert runner.peak_mb() is None
+    assert [runner.images.is_contiguous() for runner in runners] == [True, False, False]
+
+
+def test_operations_are_those_of_the_counter_in_any_form(net: nn.Module) -> None:
+    plain = operations(net, (64, 64))
+    assert plain == counted_flops(net, torch.rand(1, 3, 64, 64))
+    frozen = HybridUNet().eval().requires_grad_(requires_grad=False)  # as inference forms are
+    assert operations(frozen, (64, 64)) == plain
+    assert 0.7 * plain < operations(inference_form(net, size=(64, 64)), (64, 64)) < 0.9 * plain
+    assert next(net.parameters()).device.type == "cpu"
+
+
+def test_the_machine_is_measured(spec: Spec) -> None:
+    assert 0.1 < product(spec).matmul_gflop_per_s() < 1e6
+
+
+def test_images_are_written_once(tmp_path: Path) -> None:
+    first = images_file(tmp_path, (32, 48))
+    stamp = first.stat().st_mtime_ns
+    assert images_file(tmp_path, (32, 48)).stat().st_mtime_ns == stamp
+    assert np.load(first).shape == (COUNT, 3, 32, 48)
+    assert len(np.unique(np.load(first).reshape(COUNT, -1).mean(axis=1))) == COUNT
