@@ -109,7 +109,7 @@ class Field:
         options = {**self._of_network(), **backend.options}
         if backend.graph is not None:
             options["graph"] = str(self.folder / backend.graph)
-        entry = Entry(name, name, subject.size, False, subject.parameters, subject.flops)
+        entry = Entry(name, name, subject.size, False, subject.parameters, subject.flops, backend.what)
         self._start(Spec(name, backend.factory, self._images(), self.threads, options), entry)
 
     def _start_peer(self, label: str) -> None:
@@ -122,15 +122,18 @@ class Field:
             name = f"{label}, {spelt(size)}"
             options = {"peer": label, "size": size, "device": self.device}
             spec = Spec(name, "hudepth.bench.peers:PeerRunner", self._images(size), self.threads, options)
-            self._start(spec, Entry(name, label, size, True, None, None))
+            self._start(spec, Entry(name, label, size, True, None, None, ""))
 
     def _start(self, spec: Spec, entry: Entry) -> None:
         self._started.append((self._stack.enter_context(self._worker(spec)), entry))
 
     def _take(self, worker: Worker, entry: Entry, described: dict[str, Any]) -> None:
         if entry.peer:
-            entry = replace(entry, parameters=described["parameters"], flops=described["flops"])
-            self.note(entry.name, f"random weights, eager, {described['layout']}")
+            count, flops = described["parameters"], described["flops"]
+            about = (
+                f"random weights, eager, {described['layout']}; {count:,} parameters, {flops / 1e9:.2f} GFLOP an image"
+            )
+            entry = replace(entry, parameters=count, flops=flops, about=about)
         self.workers.append(worker)
         self.entries.append(entry)
 

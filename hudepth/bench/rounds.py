@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.bench.worker import Begun, ContenderError
+from hudepth.console import log
 
 
 @runtime_checkable
@@ -102,7 +103,8 @@ class Session:
             self.samples += here.values()
 
     def note(self, name: str, line: str) -> None:
-        """Keep a line about a contender."""
+        """Keep a line about a contender, and say it."""
+        log.warning("%s: %s", name, line)
         self.notes.setdefault(name, []).append(line)
 
     def _fits(self, contender: Contender, batch: int) -> bool:

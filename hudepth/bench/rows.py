@@ -31,6 +31,8 @@ class Entry:
     parameters: int | None
     flops: int | None
     """Of an image, of the network as it was trained."""
+    about: str
+    """For the notes."""
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,7 @@ from torch import nn
 
 from hudepth.bench.field import Subject
 from hudepth.bench.torch_runners import operations, parameters
-from hudepth.checkpoint import load_checkpoint
 from hudepth.errors import ConfigError
-from hudepth.inference.backends import EXPORTED, info_of
 from hudepth.instantiate import instantiate
 from hudepth.models.inference import inference_form
 
@@ -36,12 +34,7 @@ def make_subject(config: dict[str, Any], folder: Path) -> Subject:
         what = "both are set" if model is not None else "neither is set"
         raise ConfigError(f"checkpoint, model: {what}. Pass checkpoint=<file | run directory | last> or model=<name>.")
     if spec is not None:
-        if Path(str(spec)).suffix.lower() in EXPORTED:
-            raise ConfigError("checkpoint: exported files are made here. Pass the checkpoint or bundle it came from.")
-        checkpoint = load_checkpoint(str(spec), runs=config["paths"]["runs"])
-        net = checkpoint.build_net(trust=trust)
-        info = info_of(checkpoint, parameters=parameters(net), size=size)
-        model, size, max_depth_m = checkpoint.config["model"], info.size, info.max_depth_m
+        net, model, size, max_depth_m = _of_checkpoint(str(spec), config, trust=trust, size=size)
     else:
         torch.manual_seed(0)
         net = instantiate(_without_weights(model), trust=trust, only=object if trust else nn.Module).eval()
@@ -53,6 +46,21 @@ def make_subject(config: dict[str, Any], folder: Path) -> Subject:
         max_depth_m=max_depth_m, parameters=parameters(net), flops=operations(net, size),
         merged_flops=operations(inference_form(net, size=size), size),
     )  # fmt: skip
+
+
+def _of_checkpoint(
+    spec: str, config: dict[str, Any], *, trust: list[str], size: tuple[int, int] | None
+) -> tuple[nn.Module, dict[str, Any], tuple[int, int], float]:
+    """Return network, its configuration, size and what unit depth 1 stands for."""
+    from hudepth.checkpoint import load_checkpoint  # takes seconds, which random weights need not wait for
+    from hudepth.inference.backends import EXPORTED, info_of
+
+    if Path(spec).suffix.lower() in EXPORTED:
+        raise ConfigError("checkpoint: exported files are made here. Pass the checkpoint or bundle it came from.")
+    checkpoint = load_checkpoint(spec, runs=config["paths"]["runs"])
+    net = checkpoint.build_net(trust=trust)
+    info = info_of(checkpoint, parameters=parameters(net), size=size)
+    return net, checkpoint.config["model"], info.size, info.max_depth_m
 
 
 def _without_weights(model: Any) -> dict[str, Any]:

@@ -24,7 +24,7 @@ def sample(name: str, batch: int, pass_s: float, *, depth: float = 0.5) -> Sampl
 
 def entry(name: str, *, peer: bool = False, size: tuple[int, int] = SIZE) -> Entry:
     own = f"{name}, {size[0]} x {size[1]}" if peer else name
-    return Entry(own, name, size, peer, 1000, 2_000_000_000)
+    return Entry(own, name, size, peer, 1000, 2_000_000_000, "")
 
 
 def rows_of(**passes_s: float) -> list[Row]:

@@ -22,7 +22,7 @@ def test_the_installed_script_measures_from_any_folder(tmp_path: Path, cache: Pa
     arguments = (*TINY, "backends=[onnxruntime,default]", "output=there/bench", "threads=1")
     done = subprocess.run(**script("bench", *arguments, cwd=tmp_path, cache=cache), check=False)  # type: ignore[call-overload]
     assert done.returncode == 0, done.stdout
-    for text in ("TinyUNet, 32 x 32, 1 threads", "Fastest exact backend at batch 1: ", "Random weights:", "8,217"):
+    for text in ("TinyUNet, 32 x 32, threads: 1", "Fastest exact backend at batch 1: ", "Random weights:", "8,217"):
         assert text in done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]
     folder = tmp_path / "there" / "bench"
