@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from pathlib import Path
 
+import absl.logging
 import jaxtyping
 import pytest
 import torch
@@ -14,6 +16,8 @@ from hypothesis import settings
 # pep484_tower: an int is welcome where a float is asked for, as in any YAML file
 jaxtyping.install_import_hook("hudepth", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 torch.set_num_threads(1)
+# OpenVINO imports absl, whose handler would close the standard error that pytest captures when Hydra resets logging
+absl.logging.get_absl_handler().python_handler.stream = sys.__stderr__
 settings.register_profile("hudepth", deadline=None, max_examples=25)  # a busy machine is no failure
 settings.load_profile("hudepth")
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from hudepth.normalise import IMAGENET_MEAN, IMAGENET_STD, denormalise_image, normalise_image
+from hudepth.normalise import IMAGENET_MEAN, IMAGENET_STD, NormaliseBytes, denormalise_image, normalise_image
 
 
 def test_normalise_agrees_with_numpy() -> None:
@@ -21,3 +21,10 @@ def test_denormalise_inverts_normalise() -> None:
 
 def test_statistics_are_plain_floats() -> None:
     assert all(type(value) is float for value in (*IMAGENET_MEAN, *IMAGENET_STD))
+
+
+def test_bytes_are_normalised_as_images_are() -> None:
+    rgb = torch.randint(0, 256, (2, 5, 7, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    image = NormaliseBytes()(rgb)
+    assert torch.allclose(image, normalise_image(rgb.permute(0, 3, 1, 2).float() / 255), atol=1e-6)
+    assert image.is_contiguous(memory_format=torch.channels_last)  # as the bytes lie: nothing was copied about

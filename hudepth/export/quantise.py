@@ -35,8 +35,7 @@ def quantise(onnx: Path, path: Path, *, info: ModelInfo, images: UInt8[np.ndarra
     Raises:
         ConfigError: if a package is not installed, or there are too few images.
     """
-    if len(images) < FEWEST:
-        raise ConfigError(f"calibration: {len(images)} images are too few. Pass at least {FEWEST}, better 100.")
+    check_calibration(len(images))
     model = openvino().Core().read_model(onnx)
     with _without_telemetry():
         try:
@@ -51,6 +50,16 @@ def quantise(onnx: Path, path: Path, *, info: ModelInfo, images: UInt8[np.ndarra
             subset_size=len(images),
         )
     save_openvino(quantised, path, info=info)
+
+
+def check_calibration(images: int) -> None:
+    """Check that there are enough images.
+
+    Raises:
+        ConfigError: if there are not.
+    """
+    if images < FEWEST:
+        raise ConfigError(f"calibration: {images} images are too few. Pass at least {FEWEST}, better 100.")
 
 
 @contextmanager

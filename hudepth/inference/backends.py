@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
 from torch import nn
 
 from hudepth.checkpoint import Checkpoint
@@ -30,6 +31,7 @@ PT2 = "pt2"
 _NORMALISE = NormaliseBytes()
 
 
+@runtime_checkable
 class Backend(Protocol):
     """A model, ready to run."""
 
@@ -169,17 +171,17 @@ def _openvino_description(model: Any) -> str:
     return ""
 
 
-def _graph_input(rgb: UInt8[np.ndarray, "b h w 3"], info: ModelInfo) -> np.ndarray[Any, Any]:
+def _graph_input(rgb: UInt8[np.ndarray, "b h w 3"], info: ModelInfo) -> NDArray[Any]:
     if info.processing:
         return rgb
     return np.asarray(_NORMALISE(torch.from_numpy(rgb)).contiguous().numpy())
 
 
-def _graph_output(result: np.ndarray[Any, Any], info: ModelInfo) -> Float[np.ndarray, "b h w"]:
+def _graph_output(result: NDArray[Any], info: ModelInfo) -> Float[np.ndarray, "b h w"]:
     return np.asarray(result) if info.processing else _to_metres(result, info)
 
 
-def _to_metres(unit_depth: np.ndarray[Any, Any], info: ModelInfo) -> Float[np.ndarray, "b h w"]:
+def _to_metres(unit_depth: NDArray[Any], info: ModelInfo) -> Float[np.ndarray, "b h w"]:
     return np.maximum(unit_depth[:, 0] * np.float32(info.max_depth_m), np.float32(0))
 
 

@@ -9,12 +9,28 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageOps, UnidentifiedImageError
+from numpy.typing import NDArray
+from PIL import (
+    BmpImagePlugin,
+    GifImagePlugin,
+    Image,
+    ImageOps,
+    JpegImagePlugin,
+    PngImagePlugin,
+    PpmImagePlugin,
+    TiffImagePlugin,
+    UnidentifiedImageError,
+    WebPImagePlugin,
+)
 
 from hudepth.data.sources.files import check_pixels, read_bytes
 from hudepth.errors import DataError
 
-FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "TIFF", "GIF", "PPM")
+_PLUGINS = (
+    JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin, TiffImagePlugin, GifImagePlugin,
+    PpmImagePlugin,
+)  # fmt: skip
+FORMATS = tuple(plugin.__name__.rpartition(".")[2].removesuffix("ImagePlugin").upper() for plugin in _PLUGINS)
 """What is decoded. Pillow would also take formats that start other programs, as EPS does Ghostscript."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif", ".ppm", ".pgm")
 """Extensions that are looked for in folders, in lower case."""
@@ -55,7 +71,7 @@ def read_photo(source: str | Path | bytes, *, where: str = "") -> Photo:
     except DataError:
         raise
     except UnidentifiedImageError:
-        raise DataError(f"{where}: no image that can be read. Pass a {', '.join(FORMATS[:1] + FORMATS[2:])}.") from None
+        raise DataError(f"{where}: no image that can be read. Pass a {', '.join(FORMATS)}.") from None
     except Image.DecompressionBombError:
         raise DataError(f"{where}: more pixels than are decoded here. Resize the file.") from None
     except Exception as error:  # decoders know dozens of ways in which a file can be broken
@@ -85,7 +101,7 @@ def _to_rgb(image: Image.Image, where: str) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(upright.convert("RGB"), np.uint8)
 
 
-def as_rgb(array: np.ndarray[Any, Any], *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     """Return an array of pixels as 8-bit RGB.
 
     Args:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from PIL import Image
 
 from hudepth.checkpoint import load_checkpoint
@@ -20,7 +21,7 @@ from hudepth.inference.images import Photo, as_rgb, read_photo
 from hudepth.inference.info import ModelInfo
 from hudepth.machine import usable_cores
 
-Picture = str | Path | bytes | np.ndarray[Any, Any] | Image.Image
+Picture = str | Path | bytes | NDArray[Any] | Image.Image
 """An image: a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), or a Pillow image."""
 
 

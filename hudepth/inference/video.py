@@ -14,6 +14,10 @@ from jaxtyping import UInt8
 from hudepth.data.sources.files import check_pixels
 from hudepth.errors import DataError
 
+# FFmpeg may open files and nothing else, whatever a playlist says, and does not talk; OpenCV looks when it opens one.
+os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
 USUAL_RATE = 25.0
 """Frames a second of what does not tell."""
 CODEC = "mp4v"
@@ -32,6 +36,7 @@ class FrameReader:
 
     def __init__(self, source: Path | int) -> None:
         self.name = f"camera {source}" if isinstance(source, int) else f"'{source}'"
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # what it warns of is an error below
         self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
         if not self._capture.isOpened():
             self._capture.release()

@@ -154,7 +154,7 @@ class MergedHead(nn.Module):
             self.joint.bias.copy_(bias + (head.bias.detach().double() if head.bias is not None else 0))
         self.requires_grad_(requires_grad=False)
 
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 2h 2w"]:
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 2*h 2*w"]:
         """Return what ``head(up(x))`` returns."""
         inside = functional.pixel_shuffle(self.joint(x), 2)[:, :, 1:-1, 1:-1]
         top, bottom = self._steps(x[:, :, :2])[:, :, :1], self._steps(x[:, :, -2:])[:, :, -1:]

@@ -20,7 +20,7 @@ from hudepth.export.bundle import write_bundle, zip_folder
 from hudepth.export.card import model_card
 from hudepth.export.graphs import export_onnx, export_openvino, export_program
 from hudepth.export.parity import Parity, check, compare
-from hudepth.export.quantise import quantise
+from hudepth.export.quantise import check_calibration, quantise
 from hudepth.files import write_json
 from hudepth.inference.backends import PT2, TorchBackend, info_of, open_exported
 from hudepth.inference.info import ModelInfo
@@ -78,6 +78,8 @@ def export(cfg: DictConfig) -> None:
     info = replace(info, processing=bool(config["processing"]))
     images = export_images(checkpoint, config, size=info.size)
     output = _make(Path(str(config["output"])))
+    if "bundle" in formats:
+        _bundle_name(checkpoint, config, output)  # not after minutes
     log.info(
         "%s of %s parameters, %d x %d; compared on %d %s",
         info.name, f"{info.parameters:,}", *info.size, len(images.compared), images.origin,
@@ -123,6 +125,7 @@ def _openvino(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
 
 
 def _int8(work: Work, output: Path, _tolerance_mm: float) -> dict[str, Any]:
+    check_calibration(len(work.images.calibration))
     path, info = work.folder / "model_int8.xml", replace(work.info, processing=True)
     quantise(work.onnx(), path, info=info, images=work.images.calibration)
     backend = open_exported(path, backend="openvino", threads=usable_cores(), trust=[], precision="float32")
@@ -137,9 +140,7 @@ def _int8(work: Work, output: Path, _tolerance_mm: float) -> dict[str, Any]:
 
 
 def _bundle(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
-    name = str(work.config["name"] or work.checkpoint.config.get("name") or work.info.name)
-    if not name or name != Path(name).name or name.startswith("."):
-        raise ConfigError(f"name: '{name}' is no name for a folder. Pass name=my_model.")
+    name = _bundle_name(work.checkpoint, work.config, output)
     info = replace(work.info, processing=True)
     parity = _compared(work, work.onnx(), backend="onnxruntime", tolerance_mm=tolerance_mm)
     model = DepthModel(work.reference)
@@ -155,9 +156,16 @@ def _bundle(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
     if work.config["zip"]:
         zip_folder(folder, work.folder / f"{name}.zip")
         return _keep([work.folder / f"{name}.zip"], output, parity)
-    if (output / name).exists():
-        raise ConfigError(f"'{output / name}' exists. Remove it, or pass another name= or output=.")
     return _keep([folder], output, parity)
+
+
+def _bundle_name(checkpoint: Checkpoint, config: dict[str, Any], output: Path) -> str:
+    name = str(config["name"] or checkpoint.config.get("name") or checkpoint.config["model"]["_target_"].split(".")[-1])
+    if not name or name != Path(name).name or name.startswith("."):
+        raise ConfigError(f"name: '{name}' is no name for a folder. Pass name=my_model.")
+    if not config["zip"] and (output / name).exists():
+        raise ConfigError(f"'{output / name}' exists. Remove it, or pass another name= or output=.")
+    return name
 
 
 def _pictures(count: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from hudepth.console import shows_progress
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation import Evaluation
 from hudepth.inference.backends import Backend, TorchBackend
-from hudepth.metrics.bootstrap import paired_differences
+from hudepth.metrics.bootstrap import Difference, paired_differences
 from hudepth.metrics.scoring import image_table
 from hudepth.metrics.summary import summarise
 from hudepth.normalise import denormalise_image
@@ -74,24 +75,27 @@ def int8_accuracy(
         means = {name: summarise(table, **options) for name, table in tables.items()}
         differences = paired_differences(tables[FLOAT], tables[INT8], **options)
         changes[protocol.name] = {
-            key: {
-                FLOAT: means[FLOAT][key], INT8: means[INT8][key], "change": differences[key].value,
-                "interval": [differences[key].low, differences[key].high],
-            }
-            for key in SHOWN
-        }  # fmt: skip
+            key: {FLOAT: means[FLOAT][key], INT8: means[INT8][key], **_stated(differences[key])} for key in SHOWN
+        }
         _print(protocol.name, len(records), changes[protocol.name], datamodule.source.name)
     return changes
 
 
+def _stated(difference: Difference) -> dict[str, Any]:
+    ends = (difference.low, difference.high)  # not finite where there are too few scenes
+    return {"change": difference.value, "interval": [end if math.isfinite(end) else None for end in ends]}
+
+
 def _print(protocol: str, images: int, rows: dict[str, Any], source: str) -> None:
-    title = f"int8: {protocol} protocol, {images} test images of {source}"
-    caption = "change: int8 less float32, 95 % over scenes; rmse in metres"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    table = Table()
     for column in ("", FLOAT, INT8, "change"):
         table.add_column(column, justify="left" if not column else "right")
     for key, row in rows.items():
         low, high = row["interval"]
-        change = f"{row['change']:+.4f} [{low:+.4f}, {high:+.4f}]"
-        table.add_row(key, f"{row[FLOAT]:.4f}", f"{row[INT8]:.4f}", change)
-    Console(width=None if Console().is_terminal else 130).print(table)
+        between = "" if low is None or high is None else f" [{low:+.4f}, {high:+.4f}]"  # too few scenes for one
+        table.add_row(key, f"{row[FLOAT]:.4f}", f"{row[INT8]:.4f}", f"{row['change']:+.4f}{between}")
+    out = Console(width=None if Console().is_terminal else 130)
+    out.print(
+        f"int8: {protocol} protocol, {images} test images of {source}; change: int8 less float32, 95 % over scenes"
+    )
+    out.print(table)

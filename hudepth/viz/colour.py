@@ -46,10 +46,7 @@ def colour_depth(
 
 
 def _checked(scale_m: tuple[float, float]) -> tuple[float, float]:
-    try:
-        near, far = (float(value) for value in scale_m)
-    except (TypeError, ValueError):
-        near, far = 0.0, -1.0
+    near, far = float(scale_m[0]), float(scale_m[1])
     if not 0 <= near < far < np.inf:
         raise ConfigError(f"scale_m: {scale_m} is not two rising distances in metres. Pass scale_m=[0,10].")
     return near, far

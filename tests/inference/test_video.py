@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hudepth.errors import DataError
+from hudepth.inference.video import FrameReader, VideoWriter
+
+
+def write_video(path: Path, count: int, *, codec: str = "MJPG", size: tuple[int, int] = (48, 64)) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 10, (size[1], size[0]))
+    for number in range(count):
+        writer.write(np.full((*size, 3), (0, 0, 10 * number), np.uint8))  # OpenCV's order: blue, green, red
+    writer.release()
+
+
+def test_frames_come_in_order_as_rgb(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.avi", 12)
+    reader = FrameReader(tmp_path / "a.avi")
+    frames = list(reader)
+    assert (reader.rate, reader.expected, reader.read) == (10, 12, 12)
+    assert reader.shortfall() is None
+    assert [round(frame[..., 0].mean() / 10) for frame in frames] == list(range(12))
+    assert frames[-1][..., 2].max() < 20
+    reader.close()
+
+
+def test_a_video_that_ends_in_the_middle_is_said_to(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.avi", 40)
+    data = (tmp_path / "a.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
+    reader = FrameReader(tmp_path / "cut.avi")
+    read = len(list(reader))
+    assert 5 < read < 35
+    line = reader.shortfall()
+    assert line == f"ends after {read} of 40 frames, the file is cut off or damaged; what there is was kept"
+
+
+@pytest.mark.parametrize("content", [b"", b"text", b"#EXTM3U\n#EXTINF:1,\nfile:///x\n"], ids=["0", "text", "list"])
+def test_what_is_no_video(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "x.mp4").write_bytes(content)
+    with pytest.raises(DataError, match=r"x.mp4': cannot be opened. It is no video, or cut off before its index"):
+        FrameReader(tmp_path / "x.mp4")
+
+
+def test_a_camera_that_is_not_there() -> None:
+    with pytest.raises(DataError, match=r"camera 97: cannot be opened. Pass the number of one that is connected."):
+        FrameReader(97)
+
+
+def test_a_video_is_written_with_even_sides_and_kept_when_something_fails(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "out.mp4"
+
+    def interrupted() -> None:
+        with VideoWriter(path, rate=5) as writer:
+            for value in (10, 200, 10):
+                writer.write(np.full((33, 47, 3), value, np.uint8))
+            assert not path.exists()  # whole or not at all
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    reader = FrameReader(path)
+    frames = list(reader)
+    assert [frame.shape for frame in frames] == [(32, 46, 3)] * 3
+    assert reader.rate == 5
+    assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
+
+
+def test_no_frame_no_file(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "out.mp4", rate=5):
+        pass
+    assert list(tmp_path.iterdir()) == []
