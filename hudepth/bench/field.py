@@ -59,6 +59,8 @@ class Field:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for worker, _ in self._started:  # all at once: libraries take seconds to tidy up
+            worker.dismiss()
         self._stack.close()
 
     def enter(self, backends: Sequence[str], peers: Sequence[str] = ()) -> int:

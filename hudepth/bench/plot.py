@@ -15,7 +15,7 @@ from hudepth.viz.panels import save_figure
 from hudepth.viz.variants import COLOURS
 
 MARKERS = "osD^v"
-OURS, OTHERS = COLOURS[1], "0.65"
+OURS, OTHERS = COLOURS[1], "0.45"
 
 
 def draw_bench(rows: Sequence[Row], *, title: str) -> Figure:
@@ -31,7 +31,7 @@ def draw_bench(rows: Sequence[Row], *, title: str) -> Figure:
     axes = figure.subplots(1, 2 if beside else 1, squeeze=False)[0]
     _lines(axes[0], [row for row in rows if row.kind == "backend"])
     if beside:
-        _bars(axes[1], beside)
+        _dots(axes[1], beside)
     return figure
 
 
@@ -69,14 +69,15 @@ def _lines(axis: Axes, rows: Sequence[Row]) -> None:
     _finish(axis, "this model")
 
 
-def _bars(axis: Axes, rows: Sequence[Row]) -> None:
-    """Draw times at one batch size, the fastest at the top."""
+def _dots(axis: Axes, rows: Sequence[Row]) -> None:
+    """Draw times at one batch size, the fastest at the top; points, since bars on a scale of powers have no start."""
     ordered = sorted(rows, key=lambda row: row.ms_per_image)
     for place, row in enumerate(ordered):
-        axis.barh(place, row.ms_per_image, color=OURS if row.kind == "backend" else OTHERS, height=0.7)
-        axis.plot([row.p25_ms / row.batch, row.p75_ms / row.batch], [place, place], color="black", linewidth=1)
+        colour = OURS if row.kind == "backend" else OTHERS
+        axis.plot([row.p25_ms / row.batch, row.p75_ms / row.batch], [place, place], color=colour, linewidth=2)
+        axis.plot(row.ms_per_image, place, "o", color=colour, markersize=7)
         end = max(row.ms_per_image, row.p75_ms / row.batch)
-        axis.annotate(f"  {figure_text(row.ms_per_image)}", (end, place), va="center", fontsize=8)
+        axis.annotate(f"   {figure_text(row.ms_per_image)}", (end, place), va="center", fontsize=8)
     names = [f"this model, {row.contender}" if row.kind == "backend" else label(row) for row in ordered]
     axis.set_yticks(range(len(ordered)), names)
     axis.invert_yaxis()
@@ -86,7 +87,7 @@ def _bars(axis: Axes, rows: Sequence[Row]) -> None:
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_xlim(0.5 * ordered[0].ms_per_image, 2.5 * ordered[-1].ms_per_image)
     axis.set_xlabel("ms/image", fontsize=9)
-    _finish(axis, f"beside other networks with random weights, in eager PyTorch, at batch {ordered[0].batch}")
+    _finish(axis, f"beside other networks (random weights, eager PyTorch), at batch {ordered[0].batch}")
 
 
 def _finish(axis: Axes, title: str) -> None:

@@ -122,10 +122,14 @@ class Worker:
         rate: float = self._ask("matmul_gflop_per_s")
         return rate
 
-    def close(self) -> None:
-        """End the process, whatever it is doing."""
+    def dismiss(self) -> None:
+        """Let the process end after what it is doing, without waiting for it."""
         with suppress(OSError):
             self._pipe.send(("close",))
+
+    def close(self) -> None:
+        """End the process, whatever it is doing; a second time does nothing."""
+        self.dismiss()
         self._process.join(2)
         if self._process.is_alive():
             self._process.kill()
@@ -166,7 +170,6 @@ def serve(pipe: Connection, spec: Spec, log: Path) -> None:
                 pipe.send((True, answer(*message[1:])))
             except Exception as error:
                 pipe.send((False, said(error)))
-    os._exit(0)  # at once: libraries take seconds to tidy up what the system takes back anyway
 
 
 def said(error: BaseException) -> str:

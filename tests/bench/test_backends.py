@@ -53,6 +53,9 @@ class FakeWorker(Worker):
         Path(self.spec.options.get("graph", "/dev/null")).touch()
         return {"parameters": 3, "flops": 4, "layout": "contiguous"}
 
+    def dismiss(self) -> None:
+        pass
+
     def close(self) -> None:
         pass
 
