@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -44,6 +45,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(folder / f"mine/images/{i}.png"), image)
         cv2.imwrite(str(folder / f"mine/depths/{i}.png"), depth.astype(np.uint16) * 10)
     (folder / "nyu/index.csv").write_text("\n".join(rows) + "\n")
+    (folder / "photos").mkdir()
+    cv2.imwrite(str(folder / "photos/a.jpg"), rng.integers(0, 255, (60, 90, 3), np.uint8))
+    cv2.imwrite(str(folder / "photo.jpg"), rng.integers(0, 255, (40, 50, 3), np.uint8))
+    film = cv2.VideoWriter(str(folder / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
+    for value in (20, 120, 220):
+        film.write(np.full((48, 64, 3), value, np.uint8))
+    film.release()
     return folder
 
 
@@ -52,11 +60,24 @@ def shortened(command: str) -> list[str]:
     words = command.split()
     if words[:2] == ["hudepth-report", "paper"]:
         return [*words, "throughput=false"]
+    if words[0] == "hudepth-bench":
+        return [*words, "backends=[default]", "batches=[1]", "repeats=1", "seconds=0"]
     if words[0] != "hudepth-train" or {"--help", "--cfg"} & set(words) or "resume=" in command:
         return words
     rooms = [] if "data=" in command else ["data.source.scenes=6", "data.source.size=[48,64]"]
     weights = ["model.weights=none"] if "experiment=badcl" in command else []
     return [w for w in words if not w.startswith("trainer.max_epochs")] + SMALL + rooms + weights
+
+
+def check_demo(words: list[str], folder: Path) -> None:
+    """Start the page, which goes on until it is ended, and end it."""
+    command = [str(Path(sys.executable).parent / words[0]), *words[1:], "port=0"]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as page:
+        assert page.stderr
+        assert any("open http://127.0.0.1:" in line for line in page.stderr)
+        page.send_signal(signal.SIGINT)
+        page.stderr.read()
+    assert page.returncode in (0, 130)
 
 
 def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,6 +89,9 @@ def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPat
             continue  # the tests run inside the environment
         if words[0] == "make":
             subprocess.run(["make", "--dry-run", "--directory", str(ROOT), *words[1:]], check=True, capture_output=True)
+            continue
+        if words[0] == "hudepth-demo":
+            check_demo(words, folder)
             continue
         if words[1].startswith("resume="):
             (run,) = (folder / "runs" / "badcl").iterdir()
@@ -86,9 +110,12 @@ def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_the_python_of_the_readme(folder: Path) -> None:
-    (code,) = [block for language, block in BLOCKS if language == "python"]
+    code = "\n".join(block for language, block in BLOCKS if language == "python")
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, text=True, capture_output=True, check=True)
-    assert re.fullmatch(r"\{'boundary': [\d.]+, 'smoothness': [\d.]+, 'scaling': [\d.]+\}\n", done.stdout)
+    predicted, trained = done.stdout.splitlines()
+    assert re.fullmatch(r"\(40, 50\) [\d.]+", predicted)
+    assert (folder / "points.ply").stat().st_size > 40 * 50 * 15
+    assert re.fullmatch(r"\{'boundary': [\d.]+, 'smoothness': [\d.]+, 'scaling': [\d.]+\}", trained)
 
 
 def test_all_blocks_are_of_a_kind_that_is_tested() -> None:

@@ -12,6 +12,12 @@ from hudepth.data.store import to_mm
 from hudepth.viz.colour import colour_depth
 from hudepth.viz.point_cloud import Intrinsics, PointCloud, point_cloud
 
+FAST_PNG = (
+    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP,
+)  # fmt: skip
+"""A fifth larger than by OpenCV's defaults, in half the time, which counts beside a network that takes 50 ms."""
+
 
 @dataclass(frozen=True)
 class DepthMap:
@@ -31,9 +37,7 @@ class DepthMap:
 
         Depth is rounded to the nearest millimetre and ends at 65.535 m.
         """
-        # Level 1 with RLE: a tenth larger than the default, in a fraction of its time.
-        options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-        return cv2.imencode(".png", to_mm(self.metres), options)[1].tobytes()
+        return cv2.imencode(".png", to_mm(self.metres), FAST_PNG)[1].tobytes()
 
     def colourise(
         self, *, scale_m: tuple[float, float] | None = None, legend: bool = True

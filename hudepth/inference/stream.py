@@ -1,4 +1,4 @@
-"""Many images through one model: decoding and writing go on in other threads while it computes."""
+"""Many images through one model: decoding and writing beside its computing, or between, where that is faster."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from functools import partial
+from itertools import islice
+from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -16,8 +18,8 @@ from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel, Picture, Prepared
 
 Key = TypeVar("Key")
-AHEAD = 4
-"""Images that wait, decoded or to be written, for each thread: enough to keep all busy, few enough for memory."""
+LOT = 8
+"""Images that are decoded, predicted and written together, for each thread: few enough for memory."""
 
 
 @dataclass
@@ -32,14 +34,19 @@ class Tally:
 
 
 class Stream(Generic[Key]):
-    """Predicts images one after another, in order.
+    """Predicts images one after another, in order, a lot at a time.
+
+    A network on a CPU that has a thread for each core is slowed down by whatever runs beside it: its threads wait for
+    each other, so one that is held up holds up all. There the cores take turns: a lot is decoded, predicted, written.
+    Elsewhere (a GPU, cores to spare) a lot is written and the next one decoded while one is predicted.
 
     Args:
         model: what predicts.
         write: called in a thread with each image's key and depth.
         tally: where to count what came of it.
         batch_size: images that go through the network together.
-        workers: threads that decode, and as many that write.
+        workers: threads that decode and write; one keeps the order.
+        overlap: whether they work while the network does.
         smoothing: of frames that follow each other: the share of the depth so far that is kept, from 0 (none) to less
             than 1.
     """
@@ -52,10 +59,12 @@ class Stream(Generic[Key]):
         tally: Tally,
         batch_size: int = 1,
         workers: int = 2,
+        overlap: bool = False,
         smoothing: float = 0.0,
     ) -> None:
         self._model, self._write = model, write
         self._batch_size, self._workers, self._smoothing = batch_size, workers, smoothing
+        self._overlap = overlap
         self._so_far: Float[np.ndarray, "h w"] | None = None
         self.tally = tally
 
@@ -69,43 +78,43 @@ class Stream(Generic[Key]):
         Raises:
             OSError: if a result cannot be written; what was predicted before is kept.
         """
-        with ThreadPoolExecutor(self._workers) as decoding, ThreadPoolExecutor(self._workers) as encoding:
-            waiting: deque[Future[None]] = deque()
-            batch: list[tuple[Key, Prepared]] = []
+        with ThreadPoolExecutor(self._workers) as pool:
+            writing: deque[Future[None]] = deque()
             try:
-                for key, prepared in self._decoded(decoding, pictures):
-                    if isinstance(prepared, DataError):
-                        self.tally.failed[str(key)] = str(prepared)
+                for lot in self._lots(pool, pictures):
+                    jobs = []
+                    for key, job in self._predicted(lot):
+                        if job is not None:
+                            jobs.append(job)
                         yield key
-                        continue
-                    batch.append((key, prepared))
-                    if len(batch) == self._batch_size:
-                        yield from self._predict(batch, encoding, waiting)
-                        batch = []
-                yield from self._predict(batch, encoding, waiting)
-                while waiting:
-                    waiting.popleft().result()
+                    _wait(writing)  # of the lot before
+                    writing.extend(pool.submit(job) for job in jobs)
+                    if not self._overlap:
+                        _wait(writing)
+                _wait(writing)
             finally:
-                for future in waiting:
+                for future in writing:
                     future.cancel()
 
-    def _decoded(
+    def _lots(
         self, pool: ThreadPoolExecutor, pictures: Iterable[tuple[Key, Picture]]
-    ) -> Iterator[tuple[Key, Prepared | DataError]]:
-        """Yield prepared images in order, a few of them ahead of time."""
-        ahead: deque[tuple[Key, Future[Prepared | DataError]]] = deque()
-        try:
-            for key, picture in pictures:
-                ahead.append((key, pool.submit(self._prepare, picture)))
-                if len(ahead) > AHEAD * self._workers:
-                    first, future = ahead.popleft()
-                    yield first, future.result()
-            while ahead:
-                first, future = ahead.popleft()
-                yield first, future.result()
-        finally:
-            for _, future in ahead:
-                future.cancel()
+    ) -> Iterator[list[tuple[Key, Prepared | DataError]]]:
+        """Yield decoded images in lots, the next of which is in the making where that is no hindrance."""
+        left = iter(pictures)
+        size = max(LOT * self._workers, self._batch_size)
+
+        def begin() -> list[tuple[Key, Future[Prepared | DataError]]]:
+            return [(key, pool.submit(self._prepare, picture)) for key, picture in islice(left, size)]
+
+        coming = begin()
+        while coming:
+            lot = [(key, future.result()) for key, future in coming]
+            if self._overlap:
+                coming = begin()
+                yield lot
+            else:
+                yield lot
+                coming = begin()
 
     def _prepare(self, picture: Picture) -> Prepared | DataError:
         try:
@@ -113,20 +122,25 @@ class Stream(Generic[Key]):
         except DataError as error:
             return error
 
-    def _predict(
-        self, batch: list[tuple[Key, Prepared]], pool: ThreadPoolExecutor, waiting: deque[Future[None]]
-    ) -> Iterator[Key]:
-        if not batch:
-            return
-        depths = self._model.run([prepared for _, prepared in batch])
-        for (key, prepared), depth in zip(batch, depths, strict=True):
-            waiting.append(pool.submit(self._finish, key, prepared, self._smoothed(depth)))
-            self.tally.done += 1
-            if prepared.photo.notes:
-                self.tally.notes[str(key)] = "; ".join(prepared.photo.notes)
-            while len(waiting) > AHEAD * self._workers:
-                waiting.popleft().result()
-            yield key
+    def _predicted(
+        self, lot: list[tuple[Key, Prepared | DataError]]
+    ) -> Iterator[tuple[Key, Callable[[], None] | None]]:
+        """Yield each key of a lot with what is left to do for it."""
+        good: list[tuple[Key, Prepared]] = []
+        for key, prepared in lot:
+            if isinstance(prepared, DataError):
+                self.tally.failed[str(key)] = str(prepared)
+                yield key, None
+            else:
+                good.append((key, prepared))
+        for at in range(0, len(good), self._batch_size):
+            batch = good[at : at + self._batch_size]
+            depths = self._model.run([prepared for _, prepared in batch])
+            for (key, prepared), depth in zip(batch, depths, strict=True):
+                self.tally.done += 1
+                if prepared.photo.notes:
+                    self.tally.notes[str(key)] = "; ".join(prepared.photo.notes)
+                yield key, partial(self._finish, key, prepared, self._smoothed(depth))
 
     def _smoothed(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         if self._smoothing and self._so_far is not None:
@@ -134,5 +148,10 @@ class Stream(Generic[Key]):
         self._so_far = depth
         return depth
 
-    def _finish(self, key: Any, prepared: Prepared, depth: Float[np.ndarray, "h w"]) -> None:
+    def _finish(self, key: Key, prepared: Prepared, depth: Float[np.ndarray, "h w"]) -> None:
         self._write(key, self._model.finish(prepared, depth))
+
+
+def _wait(futures: deque[Future[None]]) -> None:
+    while futures:
+        futures.popleft().result()

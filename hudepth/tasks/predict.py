@@ -9,6 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import cv2
 from omegaconf import DictConfig
 
 from hudepth.console import log, track
@@ -20,6 +21,7 @@ from hudepth.inference.model import DepthModel, load
 from hudepth.inference.stream import Stream, Tally
 from hudepth.inference.video import FrameReader, VideoWriter
 from hudepth.inference.writing import Style, check_formats, write_depth
+from hudepth.machine import usable_cores
 from hudepth.tasks.config import plain, whole_number
 from hudepth.viz.point_cloud import Intrinsics
 
@@ -39,6 +41,8 @@ class Job:
     """None: what is usual for images, videos and cameras."""
     style: Style
     batch_size: int
+    overlap: bool
+    """Whether files are decoded and written while the network computes; see :class:`Stream`."""
     smoothing: float
     frames: int | None
     """Of each video or camera; None: all."""
@@ -86,10 +90,17 @@ def _job(config: dict[str, Any], inputs: Inputs) -> Job:
     frames = None if config["frames"] is None else whole_number(config, "frames", default=1, least=1)
     output = _output_folder(Path(str(config["output"])), inputs)
     model = load_model(config)
+    cv2.setNumThreads(1)  # decoding and writing have threads of their own
     return Job(
-        model, output, formats, Style(_scale(config["scale_m"], model), intrinsics), _batch_size(config, model),
-        smoothing, frames,
-    )  # fmt: skip
+        model,
+        output,
+        formats,
+        Style(_scale(config["scale_m"], model), intrinsics),
+        batch_size=_batch_size(config, model),
+        overlap=_has_cores_to_spare(config, model),
+        smoothing=smoothing,
+        frames=frames,
+    )
 
 
 def load_model(config: dict[str, Any]) -> DepthModel:
@@ -123,7 +134,7 @@ def _predict_images(job: Job, items: list[Item]) -> None:
     def write(key: str, depth: DepthMap) -> None:
         write_depth(stems[key], depth, job.formats or IMAGE_FORMATS, job.style)
 
-    stream: Stream[str] = Stream(job.model, write, tally=job.tally, batch_size=job.batch_size)
+    stream: Stream[str] = Stream(job.model, write, tally=job.tally, batch_size=job.batch_size, overlap=job.overlap)
     pictures = ((str(item.path), item.path) for item in items)
     for _ in track(stream.run(pictures), total=len(items), what="predicting"):
         pass
@@ -216,11 +227,19 @@ def _listed(value: object) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list) else [str(value)]
 
 
+def _on_gpu(model: DepthModel) -> bool:
+    device = getattr(model.backend, "device", None)
+    return device is not None and device.type != "cpu"
+
+
+def _has_cores_to_spare(config: dict[str, Any], model: DepthModel) -> bool:
+    return _on_gpu(model) or (config["threads"] is not None and config["threads"] < usable_cores())
+
+
 def _batch_size(config: dict[str, Any], model: DepthModel) -> int:
     if config["batch_size"] is not None:
         return whole_number(config, "batch_size", default=1, least=1)
-    device = getattr(model.backend, "device", None)
-    return 1 if device is None or device.type == "cpu" else 16  # on CPUs larger batches are slower: caches overflow
+    return 16 if _on_gpu(model) else 1  # on CPUs larger batches are slower: caches overflow
 
 
 def _smoothing(value: object) -> float:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel
-from hudepth.inference.stream import AHEAD, Stream, Tally
+from hudepth.inference.stream import LOT, Stream, Tally
 
 
 def frame(value: int) -> np.ndarray:
@@ -19,14 +19,17 @@ def frame(value: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("batch_size", "batches"), [(1, [1] * 10), (4, [4, 4, 2]), (100, [10])])
-def test_every_image_is_written_once_in_batches(grey: DepthModel, batch_size: int, batches: list[int]) -> None:
+@pytest.mark.parametrize("overlap", [False, True])
+def test_every_image_is_written_once_in_batches(
+    grey: DepthModel, batch_size: int, batches: list[int], overlap: bool
+) -> None:
     written: dict[int, float] = {}
 
     def write(key: int, depth: DepthMap) -> None:
         written[key] = float(depth.metres[0, 0])
 
     tally = Tally()
-    stream: Stream[int] = Stream(grey, write, tally=tally, batch_size=batch_size)
+    stream: Stream[int] = Stream(grey, write, tally=tally, batch_size=batch_size, overlap=overlap)
     assert list(stream.run((value, frame(value)) for value in range(10))) == list(range(10))
     assert written == {value: pytest.approx(value / 100) for value in range(10)}
     assert tally.done == 10
@@ -57,7 +60,8 @@ def test_frames_are_smoothed_in_order(grey: DepthModel) -> None:
     assert written == pytest.approx([1.0, 1.5, 1.75])
 
 
-def test_a_slow_disk_holds_back_the_reading(grey: DepthModel) -> None:
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_slow_disk_holds_back_the_reading(grey: DepthModel, overlap: bool) -> None:
     """However long the video, no more than a few frames are in memory."""
     read, written, most = 0, 0, 0
     lock = threading.Lock()
@@ -76,10 +80,10 @@ def test_a_slow_disk_holds_back_the_reading(grey: DepthModel) -> None:
         with lock:
             written += 1
 
-    stream: Stream[int] = Stream(grey, write, tally=Tally(), workers=1)
+    stream: Stream[int] = Stream(grey, write, tally=Tally(), workers=1, overlap=overlap)
     list(stream.run(frames()))
     assert written == 60
-    assert most <= 2 * AHEAD + 4  # those ahead, those waiting, and those in hand
+    assert most <= 3 * LOT  # one lot being written, one in hand, one ahead
 
 
 def test_a_full_disk_ends_it(grey: DepthModel) -> None:
