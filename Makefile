@@ -21,7 +21,7 @@ demo: $(INSTALLED)  ## train and test a first model on built-in rooms, in under 
 	$(BIN)/hudepth-train +experiment=demo
 
 test: $(INSTALLED)  ## run all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(INSTALLED)  ## ruff and mypy --strict
 	$(BIN)/ruff check .

@@ -61,7 +61,11 @@ def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version
     text = (ROOT / "pyproject.toml").read_text()
     tested = (ROOT / "constraints.txt").read_text()
     optional = PROJECT["project"]["optional-dependencies"]
-    extras = [each for extra in ("dev", "joblib", "slurm", "search") for each in optional[extra]]
+    extras = [
+        each
+        for extra in ("dev", "joblib", "slurm", "search", "onnx", "openvino", "demo", "peers")
+        for each in optional[extra]
+    ]
     for requirement in PROJECT["project"]["dependencies"]:
         name = re.split(r"[><=]", requirement)[0]
         assert ">=" in requirement

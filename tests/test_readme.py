@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -139,6 +141,14 @@ def test_the_results_are_those_of_the_run() -> None:
         assert row, name
         shown = [cell.strip() for cell in row[1].split("|")]
         assert shown == [f"{values[key]:.3f}" for key in ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")]
+
+
+def test_the_speeds_are_those_of_the_benchmark() -> None:
+    speed = ROOT / "experiments" / "speed"
+    table = runpy.run_path(str(speed / "inference_table.py"))["table"]
+    with (speed / "inference" / "bench.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert README.split("<!-- speed -->\n")[1].strip() == table(rows)
 
 
 def test_what_a_random_split_is_worth_is_what_the_study_found() -> None:

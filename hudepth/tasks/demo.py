@@ -13,9 +13,9 @@ from hudepth.console import log
 from hudepth.demo.answers import Limits, answer
 from hudepth.demo.server import free_port, serve
 from hudepth.errors import ConfigError
-from hudepth.inference.model import DepthModel, load
+from hudepth.inference.model import DepthModel
 from hudepth.tasks.config import plain, whole_number
-from hudepth.viz.point_cloud import Intrinsics
+from hudepth.tasks.models import intrinsics, load_model
 
 MEGABYTE = 2**20
 
@@ -32,7 +32,7 @@ def demo(cfg: DictConfig) -> None:
     config = plain(cfg)
     if importlib.util.find_spec("gradio") is None:
         raise ConfigError("gradio is not installed. Run pip install 'hudepth[demo]'.")
-    limits, camera = _limits(config), _intrinsics(config["intrinsics"])
+    limits, camera = _limits(config), intrinsics(config["intrinsics"])
     host, port = str(config["host"]), _port(config)
     free_port(host, port)  # before the seconds that loading takes
     model = _load(config)
@@ -57,11 +57,7 @@ def describe(model: DepthModel) -> str:
 
 def _load(config: dict[str, Any]) -> DepthModel:
     """Load the model and run it once, so that the first visitor does not wait for what is set up on first use."""
-    model = load(
-        str(config["checkpoint"]),
-        **{name: config[name] for name in ("backend", "device", "precision", "threads", "fit", "trust")},
-        runs=config["paths"]["runs"],
-    )
+    model = load_model(config)
     model.predict(np.zeros((*model.info.size, 3), np.uint8))
     return model
 
@@ -79,12 +75,3 @@ def _limits(config: dict[str, Any]) -> Limits:
         raise ConfigError(f"max_upload_mb: {megabytes} is not above 0 and at most 1024. Leave it out for 20.")
     pixels = whole_number(config, "max_pixels", default=40_000_000, least=1)
     return Limits(upload_bytes=int(megabytes * MEGABYTE), pixels=pixels)
-
-
-def _intrinsics(value: Any) -> Intrinsics | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 4 or not all(isinstance(entry, int | float) for entry in value):
-        raise ConfigError(f"intrinsics: {value} is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the pictures.")
-    fx, fy, cx, cy = (float(entry) for entry in value)
-    return Intrinsics(fx, fy, cx, cy)

@@ -17,13 +17,13 @@ from hudepth.errors import ConfigError, DataError
 from hudepth.files import write_json
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.inputs import Inputs, Item, find_inputs
-from hudepth.inference.model import DepthModel, load
+from hudepth.inference.model import DepthModel
 from hudepth.inference.stream import Stream, Tally
 from hudepth.inference.video import FrameReader, VideoWriter
 from hudepth.inference.writing import Style, check_formats, write_depth
 from hudepth.machine import usable_cores
 from hudepth.tasks.config import plain, whole_number
-from hudepth.viz.point_cloud import Intrinsics
+from hudepth.tasks.models import intrinsics, load_model
 
 IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]
 """What is written where nothing is said."""
@@ -86,16 +86,17 @@ def predict(cfg: DictConfig) -> None:
 def _job(config: dict[str, Any], inputs: Inputs) -> Job:
     """Check all options, and that the output folder can be written, before the model is loaded."""
     formats = None if config["formats"] is None else check_formats(_listed(config["formats"]))
-    smoothing, intrinsics = _smoothing(config["smoothing"]), _intrinsics(config["intrinsics"])
+    smoothing, camera = _smoothing(config["smoothing"]), intrinsics(config["intrinsics"])
     frames = None if config["frames"] is None else whole_number(config, "frames", default=1, least=1)
     output = _output_folder(Path(str(config["output"])), inputs)
     model = load_model(config)
+    _say(model)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
     return Job(
         model,
         output,
         formats,
-        Style(_scale(config["scale_m"], model), intrinsics),
+        Style(_scale(config["scale_m"], model), camera),
         batch_size=_batch_size(config, model),
         overlap=_has_cores_to_spare(config, model),
         smoothing=smoothing,
@@ -103,29 +104,13 @@ def _job(config: dict[str, Any], inputs: Inputs) -> Job:
     )
 
 
-def load_model(config: dict[str, Any]) -> DepthModel:
-    """Load the model that a configuration names, and say in the log what it is.
-
-    Args:
-        config: with ``checkpoint``, ``paths`` and the options of :func:`hudepth.inference.model.load`.
-
-    Raises:
-        HudepthError: with one line for the user.
-    """
-    names = ("backend", "device", "precision", "threads", "size", "fit")
-    options = {name: config[name] for name in names if name in config}
-    if options.get("size") is not None:
-        if not isinstance(options["size"], list) or len(options["size"]) != 2:
-            raise ConfigError(f"size: {options['size']} is not [height,width]. Pass size=[224,224].")
-        options["size"] = (int(options["size"][0]), int(options["size"][1]))
-    model = load(str(config["checkpoint"]), **options, trust=config["trust"], runs=config["paths"]["runs"])
+def _say(model: DepthModel) -> None:
     info = model.info
     log.info(
         "model: %s of %s parameters, trained on %s for %d epochs; %d x %d, up to %g m; %s, fit=%s",
         info.name, f"{info.parameters:,}", info.trained_on.get("source", "unknown data"), info.epoch,
         *info.size, info.max_depth_m, model.backend.name, model.fit,
     )  # fmt: skip
-    return model
 
 
 def _predict_images(job: Job, items: list[Item]) -> None:
@@ -256,12 +241,3 @@ def _scale(value: Any, model: DepthModel) -> tuple[float, float]:
         if 0 <= near < far:
             return near, far
     raise ConfigError(f"scale_m: {value} is not two rising distances in metres. Pass scale_m=[0,10].")
-
-
-def _intrinsics(value: Any) -> Intrinsics | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 4 or not all(isinstance(entry, int | float) for entry in value):
-        raise ConfigError(f"intrinsics: {value} is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the images.")
-    fx, fy, cx, cy = (float(entry) for entry in value)
-    return Intrinsics(fx, fy, cx, cy)

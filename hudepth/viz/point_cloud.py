@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hudepth.data.sources.raycast import nyu_intrinsics
 from hudepth.errors import ConfigError
-
-NYU_INTRINSICS = (518.857901, 519.469611, 325.582449, 253.736166)
-"""fx, fy, cx, cy of NYU Depth V2's colour camera [pixels], at 640 x 480 (Silberman et al. 2012, its toolbox)."""
-NYU_SIZE = (480, 640)
 
 
 @dataclass(frozen=True)
@@ -36,10 +33,8 @@ class Intrinsics:
 
     @classmethod
     def of_nyu(cls, height: int, width: int) -> Intrinsics:
-        """Return those of NYU's camera, scaled to another size: each axis on its own."""
-        fx, fy, cx, cy = NYU_INTRINSICS
-        x, y = width / NYU_SIZE[1], height / NYU_SIZE[0]
-        return cls(fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5, known=False)
+        """Return those of NYU's camera, scaled to another size."""
+        return cls(*nyu_intrinsics(height, width), known=False)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from .conftest import Command
         ("max_upload_mb=0", "max_upload_mb: 0 is not above 0 and at most 1024. Leave it out for 20."),
         ("max_pixels=0", "max_pixels: 0 is no whole number of at least 1. Leave it out for 40000000."),
         ("max_pixels=200000000", "max_pixels: 200000000 is not from 1 to 100000000. Leave it out for 40000000."),
-        ("intrinsics=[1,2]", "intrinsics: [1, 2] is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the pictures."),
+        ("intrinsics=[1,2]", "intrinsics: [1, 2] is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the images."),
         ("intrinsics=[0,1,2,3]", "intrinsics: [0.0,1.0,2.0,3.0] is no camera."),
         ("fit=streched", "fit: no 'streched'. Did you mean 'stretch'?"),
         ("prot=1", "no key 'prot'. Did you mean 'port'?"),

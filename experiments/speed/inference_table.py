@@ -1,0 +1,47 @@
+"""Bring a benchmark's tables here, and its figures at batch 1 and 8 into the README, between its markers.
+
+hudepth-bench checkpoint=<run> peers=true repeats=3 seconds=0.7 output=inference
+python experiments/speed/inference_table.py inference
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sys
+from pathlib import Path
+
+from hudepth.files import write_between
+
+ROOT = Path(__file__).parents[2]
+KEPT = ("bench.md", "bench.csv", "bench.png", "bench.json")
+SHOWN = {
+    "eager": "plain PyTorch", "channels_last": "channels-last", "default": "what `predict` and `test` use",
+    "compile": "the same, `torch.compile`", "onnxruntime": "ONNX Runtime", "openvino": "OpenVINO",
+    "openvino_bf16": "OpenVINO, bfloat16 (not exact)", "int8": "OpenVINO, int8 (not exact)",
+}  # fmt: skip
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """Return the backends' figures as Markdown."""
+    lines = [
+        "| 224 x 224, two CPU cores | ms/image, batch 1 | x plain | ms/image, batch 8 | x plain |",
+        "|---|---|---|---|---|",
+    ]
+    found = {(row["contender"], int(row["batch"])): row for row in rows if row["kind"] == "backend"}
+    for name, words in SHOWN.items():
+        cells = []
+        for batch in (1, 8):
+            row = found.get((name, batch))
+            cells += [f"{float(row['ms_per_image']):.1f}", f"{float(row['times_eager']):.2f}"] if row else ["-", "-"]
+        lines.append(f"| {words} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    target = ROOT / "experiments" / "speed" / "inference"
+    target.mkdir(exist_ok=True)
+    for name in KEPT:
+        shutil.copyfile(Path(sys.argv[1]) / name, target / name)
+    with (target / "bench.csv").open(encoding="utf-8") as file:
+        write_between(ROOT / "README.md", "speed", table(list(csv.DictReader(file))))
