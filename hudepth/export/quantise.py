@@ -23,8 +23,8 @@ FEWEST = 8
 def quantise(onnx: Path, path: Path, *, info: ModelInfo, images: UInt8[np.ndarray, "n h w 3"]) -> None:
     """Quantise a float model to int8 by its activations on ``images``, with NNCF, and write it for OpenVINO.
 
-    OpenVINO's int8 was more than twice as fast as ONNX Runtime's static quantisation on the same network, and nearer
-    to the original (``experiments/speed``), so it is the one there is.
+    OpenVINO's int8 was more than twice as fast as ONNX Runtime's static quantisation when both were tried on this
+    network, and nearer to the original, so it is the one there is.
 
     Args:
         onnx: a float model whose graph holds the processing.
