@@ -43,15 +43,15 @@ BACKENDS = {
     ),
     "openvino": Backend(
         f"{_GRAPH}:OpenVinoRunner", "the same file in OpenVINO, in float32",
-        packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "f32"},
+        packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "float32"},
     ),
     "openvino_bf16": Backend(
         f"{_GRAPH}:OpenVinoRunner", "the same file in OpenVINO, in bfloat16: not exact",
-        packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "bf16"},
+        packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "bfloat16"},
     ),
     "int8": Backend(
         f"{_GRAPH}:OpenVinoRunner", "OpenVINO, quantised on a handful of built-in rooms: for its speed, not its depth",
-        packages=(*_OPENVINO, "nncf"), extras="onnx,openvino", graph=INT8, options={"precision": "f32"},
+        packages=(*_OPENVINO, "nncf"), extras="onnx,openvino", graph=INT8, options={"precision": "float32"},
     ),
 }  # fmt: skip
 """By name, in the table's order."""

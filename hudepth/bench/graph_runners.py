@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.bench.worker import Spec
+from hudepth.inference.runtimes import onnx_session, openvino_model
 
 
 class OnnxRunner:
@@ -22,11 +23,7 @@ class OnnxRunner:
     """
 
     def __init__(self, spec: Spec) -> None:
-        runtime = importlib.import_module("onnxruntime")
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = spec.threads
-        options.log_severity_level = 3  # errors
-        self._session = runtime.InferenceSession(spec.options["graph"], options, providers=["CPUExecutionProvider"])
+        self._session = onnx_session(Path(spec.options["graph"]), threads=spec.threads)
         self._input = self._session.get_inputs()[0].name
 
     def describe(self) -> dict[str, Any]:
@@ -50,18 +47,12 @@ class OpenVinoRunner:
     """OpenVINO on the CPU, with the options that predicting uses.
 
     Args:
-        spec: with the options ``graph``, an ONNX or IR file, and ``precision``, OpenVINO's name of it.
+        spec: with the options ``graph``, an ONNX or IR file, and ``precision``.
     """
 
     def __init__(self, spec: Spec) -> None:
-        core = importlib.import_module("openvino").Core()
-        options = {
-            "PERFORMANCE_HINT": "LATENCY",
-            "INFERENCE_PRECISION_HINT": spec.options["precision"],
-            "INFERENCE_NUM_THREADS": spec.threads,
-        }
-        compiled = core.compile_model(core.read_model(spec.options["graph"]), "CPU", options)
-        self._request = compiled.create_infer_request()
+        graph, precision = Path(spec.options["graph"]), spec.options["precision"]
+        _, self._request = openvino_model(graph, threads=spec.threads, precision=precision)
 
     def describe(self) -> dict[str, Any]:
         """Nothing that is not known from elsewhere."""

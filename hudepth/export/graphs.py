@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 import warnings
@@ -15,10 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from hudepth import __version__
-from hudepth.errors import ConfigError
 from hudepth.files import written_whole
 from hudepth.inference.info import KEY, ModelInfo
 from hudepth.inference.pipeline import DepthPipeline
+from hudepth.inference.runtimes import package
 
 OPSET = 18
 INPUT = "image"
@@ -73,11 +72,8 @@ def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
     Raises:
         ConfigError: if ``onnx`` or ``onnxscript`` is not installed.
     """
-    for package in ("onnx", "onnxscript"):
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise ConfigError(f"{package} is not installed. Run pip install 'hudepth[onnx]'.") from error
+    for name in ("onnx", "onnxscript"):
+        package(name, extra="onnx")
     graph, image = export_graph(net, info)
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
@@ -143,10 +139,7 @@ def openvino() -> Any:
     Raises:
         ConfigError: if it is not installed.
     """
-    try:
-        return importlib.import_module("openvino")
-    except ImportError as error:
-        raise ConfigError("openvino is not installed. Run pip install 'hudepth[openvino]'.") from error
+    return package("openvino", extra="openvino")
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from jaxtyping import UInt8
 from hudepth.errors import ConfigError
 from hudepth.export.graphs import openvino, save_openvino
 from hudepth.inference.info import ModelInfo
+from hudepth.inference.runtimes import package
 
 FEWEST = 8
 """Images below which ranges are not worth the name."""
@@ -38,10 +38,7 @@ def quantise(onnx: Path, path: Path, *, info: ModelInfo, images: UInt8[np.ndarra
     check_calibration(len(images))
     model = openvino().Core().read_model(onnx)
     with _without_telemetry():
-        try:
-            nncf = importlib.import_module("nncf")
-        except ImportError as error:
-            raise ConfigError("nncf is not installed. Run pip install 'hudepth[openvino]'.") from error
+        nncf = package("nncf", extra="openvino")
         nncf.set_log_level(logging.ERROR)
         quantised = nncf.quantize(
             model,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,11 +18,10 @@ from hudepth.checkpoint import Checkpoint
 from hudepth.errors import CheckpointError, ConfigError, did_you_mean
 from hudepth.inference.info import KEY, ModelInfo
 from hudepth.inference.pipeline import DepthPipeline
+from hudepth.inference.runtimes import PRECISIONS, onnx_session, openvino_model
 from hudepth.models.inference import inference_form
 from hudepth.normalise import NormaliseBytes
 
-PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
-"""In which OpenVINO computes, and its own names of them; bfloat16 is not exact."""
 EXPORTED = {".onnx": "onnxruntime", ".xml": "openvino", ".pt2": "torch"}
 """Exported files, and the backend that reads each wherever its package is installed."""
 BACKENDS = ("auto", "torch", "onnxruntime", "openvino")
@@ -110,14 +110,7 @@ class OnnxBackend:
     name = "onnxruntime"
 
     def __init__(self, path: Path, *, threads: int) -> None:
-        runtime = _package("onnxruntime", extra="onnx")
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.log_severity_level = 3  # errors
-        try:
-            self._session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:
-            raise _unreadable(path, error) from error
+        self._session = _opened(path, partial(onnx_session, threads=threads))
         described = self._session.get_modelmeta().custom_metadata_map.get(KEY, "")
         self.info = _described(described, path)
         self._input = self._session.get_inputs()[0].name
@@ -143,19 +136,8 @@ class OpenVinoBackend:
     name = "openvino"
 
     def __init__(self, path: Path, *, threads: int, precision: str = "float32") -> None:
-        openvino = _package("openvino", extra="openvino")
-        core = openvino.Core()
-        options = {
-            "PERFORMANCE_HINT": "LATENCY",
-            "INFERENCE_PRECISION_HINT": PRECISIONS[precision],
-            "INFERENCE_NUM_THREADS": threads,
-        }
-        try:
-            model = core.read_model(path)
-            described = _openvino_description(model)
-            self._request = core.compile_model(model, "CPU", options).create_infer_request()
-        except Exception as error:
-            raise _unreadable(path, error) from error
+        model, self._request = _opened(path, partial(openvino_model, threads=threads, precision=precision))
+        described = _openvino_description(model)
         self.info = _described(described, path)
 
     def __call__(self, rgb: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
@@ -278,11 +260,13 @@ def check_backend(backend: str, precision: str) -> None:
             raise ConfigError(f"{key}: no '{value}'.{did_you_mean(value, choices)} Pass one of {', '.join(choices)}.")
 
 
-def _package(name: str, *, extra: str) -> Any:
+def _opened(path: Path, read: Callable[[Path], Any]) -> Any:
     try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ConfigError(f"{name} is not installed. Run pip install 'hudepth[{extra}]'.") from error
+        return read(path)
+    except ConfigError:  # the package is not there
+        raise
+    except Exception as error:
+        raise _unreadable(path, error) from error
 
 
 def _described(text: str, path: Path) -> ModelInfo:

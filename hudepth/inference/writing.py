@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.errors import ConfigError, did_you_mean
 from hudepth.files import written_whole
 from hudepth.inference.depth_map import DepthMap
 from hudepth.viz.point_cloud import Intrinsics
@@ -58,20 +57,6 @@ FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], None]]] = {
 }
 """By name: how the file's name goes on after the image's, and what writes it. ``png16`` is in millimetres, ``npy`` and
 ``ply`` in metres, ``colour`` and ``side`` are pictures with a scale."""
-
-
-def check_formats(formats: Sequence[str]) -> list[str]:
-    """Return the names of formats, each once.
-
-    Raises:
-        ConfigError: if there is no such format, or none at all.
-    """
-    for name in formats:
-        if name not in FORMATS:
-            raise ConfigError(f"formats: no '{name}'.{did_you_mean(name, FORMATS)} Pass some of {', '.join(FORMATS)}.")
-    if not formats:
-        raise ConfigError(f"formats: none is given. Pass some of {', '.join(FORMATS)}.")
-    return list(dict.fromkeys(formats))
 
 
 def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Style) -> None:

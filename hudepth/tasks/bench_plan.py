@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import torch
 from hudepth.bench.backends import check_backends
 from hudepth.errors import ConfigError
 from hudepth.machine import usable_cores
-from hudepth.tasks.config import whole_number
+from hudepth.tasks.config import output_folder, whole_number
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def make_plan(config: dict[str, Any]) -> Plan:
         longest_pass=_seconds(config, "longest_pass", default=10, zero=False),
         threads=threads,
         device=_device(str(config["device"])),
-        output=_made(Path(str(config["output"])).expanduser()),
+        output=output_folder(config["output"]),
     )
 
 
@@ -91,12 +90,3 @@ def _device(name: str) -> str:
             f"device: no '{name}' here. Pass device={' or '.join(k for k, here in there.items() if here)}."
         )
     return name
-
-
-def _made(output: Path) -> Path:
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=output):
-            return output
-    except OSError as error:
-        raise ConfigError(f"output: cannot write to '{output}' ({error.strerror}). Pass output=<a folder>.") from error

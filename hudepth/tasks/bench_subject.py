@@ -13,6 +13,7 @@ from hudepth.bench.torch_runners import operations, parameters
 from hudepth.errors import ConfigError
 from hudepth.instantiate import instantiate
 from hudepth.models.inference import inference_form
+from hudepth.tasks.config import size_option
 
 USUAL_SIZE, USUAL_MAX_DEPTH_M = (224, 224), 10.0
 """Of a model that no checkpoint says it of."""
@@ -28,7 +29,7 @@ def make_subject(config: dict[str, Any], folder: Path) -> Subject:
     Raises:
         HudepthError: if there is no such checkpoint, or the network cannot be built or does not take the size.
     """
-    size, trust = _size(config["size"]), [str(name) for name in config["trust"]]
+    size, trust = size_option(config["size"]), [str(name) for name in config["trust"]]
     spec, model = config["checkpoint"], config.get("model")
     if (spec is None) == (model is None):
         what = "both are set" if model is not None else "neither is set"
@@ -66,11 +67,3 @@ def _of_checkpoint(
 def _without_weights(model: Any) -> dict[str, Any]:
     """Return a model's configuration without what it starts from: its tensors are given."""
     return {**model, **({"weights": None} if "weights" in model else {})}
-
-
-def _size(value: Any) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 2 or not all(type(side) is int and side > 0 for side in value):
-        raise ConfigError(f"size: {value} is not [height,width]. Pass size=[224,224].")
-    return value[0], value[1]

@@ -15,7 +15,7 @@ from torch import nn
 
 from hudepth.checkpoint import Checkpoint, load_checkpoint
 from hudepth.console import log
-from hudepth.errors import ConfigError, did_you_mean
+from hudepth.errors import ConfigError
 from hudepth.export.bundle import write_bundle, zip_folder
 from hudepth.export.card import model_card
 from hudepth.export.graphs import export_onnx, export_openvino, export_program
@@ -27,7 +27,7 @@ from hudepth.inference.info import ModelInfo
 from hudepth.inference.model import DepthModel
 from hudepth.machine import usable_cores
 from hudepth.models.inference import inference_form
-from hudepth.tasks.config import plain, whole_number
+from hudepth.tasks.config import output_folder, plain, several, size_option, whole_number
 from hudepth.tasks.export_accuracy import int8_accuracy
 from hudepth.tasks.export_images import ExportImages, export_images
 
@@ -66,18 +66,18 @@ def export(cfg: DictConfig) -> None:
         HudepthError: with one line for the user; formats that were good before it are kept.
     """
     config = plain(cfg)
-    formats = _formats(config["format"])
+    formats = several("format", config["format"], FORMATS)
     tolerance_mm = _tolerance(config["tolerance_mm"])
     for key in ("compared", "calibration"):
         whole_number(config, key, default=50, least=1)
     checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
     device = _cpu()
     net = checkpoint.build_net(trust=config["trust"])
-    info = info_of(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=_size(config["size"]))
+    info = info_of(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size_option(config["size"]))
     reference = TorchBackend(net, info, device=device)  # as it was trained: what is exported is held against that
     info = replace(info, processing=bool(config["processing"]))
     images = export_images(checkpoint, config, size=info.size)
-    output = _make(Path(str(config["output"])))
+    output = output_folder(config["output"])
     if "bundle" in formats:
         _bundle_name(checkpoint, config, output)  # not after minutes
     log.info(
@@ -203,28 +203,10 @@ def _results(checkpoint: Checkpoint) -> dict[str, dict[str, Any]]:
     return {file.parent.name: json.loads(file.read_text(encoding="utf-8")) for file in files}
 
 
-def _formats(value: object) -> list[str]:
-    names = [str(item) for item in value] if isinstance(value, list) else [str(value)]
-    for name in names:
-        if name not in FORMATS:
-            raise ConfigError(f"format: no '{name}'.{did_you_mean(name, FORMATS)} Pass some of {', '.join(FORMATS)}.")
-    if not names:
-        raise ConfigError(f"format: none is given. Pass some of {', '.join(FORMATS)}.")
-    return list(dict.fromkeys(names))
-
-
 def _tolerance(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
         raise ConfigError(f"tolerance_mm: {value} is no positive number of millimetres. Leave it out for 1.")
     return float(value)
-
-
-def _size(value: Any) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(side, int) for side in value):
-        raise ConfigError(f"size: {value} is not [height,width]. Pass size=[224,224].")
-    return value[0], value[1]
 
 
 def _cpu() -> Any:
@@ -232,12 +214,3 @@ def _cpu() -> Any:
 
     torch.set_num_threads(usable_cores())
     return torch.device("cpu")
-
-
-def _make(output: Path) -> Path:
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=output):
-            return output
-    except OSError as error:
-        raise ConfigError(f"output: cannot write to '{output}' ({error.strerror}). Pass output=<a folder>.") from error

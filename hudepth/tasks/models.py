@@ -7,6 +7,7 @@ from typing import Any
 
 from hudepth.errors import ConfigError
 from hudepth.inference.model import DepthModel, load
+from hudepth.tasks.config import size_option
 from hudepth.viz.point_cloud import Intrinsics
 
 OPTIONS = ("backend", "device", "precision", "threads", "size", "fit", "trust")
@@ -23,11 +24,8 @@ def load_model(config: Mapping[str, Any]) -> DepthModel:
         HudepthError: with one line for the user.
     """
     options = {name: config[name] for name in OPTIONS if name in config}
-    size = options.get("size")
-    if size is not None:
-        if not isinstance(size, list) or len(size) != 2 or not all(isinstance(side, int) for side in size):
-            raise ConfigError(f"size: {size} is not [height,width]. Pass size=[224,224].")
-        options["size"] = (size[0], size[1])
+    if "size" in options:
+        options["size"] = size_option(options["size"])
     return load(str(config["checkpoint"]), **options, runs=config["paths"]["runs"])
 
 

@@ -20,9 +20,9 @@ from hudepth.inference.inputs import Inputs, Item, find_inputs
 from hudepth.inference.model import DepthModel
 from hudepth.inference.stream import Stream, Tally
 from hudepth.inference.video import FrameReader, VideoWriter
-from hudepth.inference.writing import Style, check_formats, write_depth
+from hudepth.inference.writing import FORMATS, Style, write_depth
 from hudepth.machine import usable_cores
-from hudepth.tasks.config import plain, whole_number
+from hudepth.tasks.config import output_folder, plain, several, whole_number
 from hudepth.tasks.models import intrinsics, load_model
 
 IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]
@@ -85,10 +85,10 @@ def predict(cfg: DictConfig) -> None:
 
 def _job(config: dict[str, Any], inputs: Inputs) -> Job:
     """Check all options, and that the output folder can be written, before the model is loaded."""
-    formats = None if config["formats"] is None else check_formats(_listed(config["formats"]))
+    formats = None if config["formats"] is None else several("formats", config["formats"], FORMATS)
     smoothing, camera = _smoothing(config["smoothing"]), intrinsics(config["intrinsics"])
     frames = None if config["frames"] is None else whole_number(config, "frames", default=1, least=1)
-    output = _output_folder(Path(str(config["output"])), inputs)
+    output = _not_the_input(output_folder(config["output"]), inputs)
     model = load_model(config)
     _say(model)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
@@ -189,27 +189,11 @@ def _report(job: Job, config: dict[str, Any], *, seconds: float) -> None:
         log.warning("'%s' could not be written", job.output / "predictions.json")
 
 
-def _output_folder(output: Path, inputs: Inputs) -> Path:
-    """Make the folder and try to write to it, before anything is computed.
-
-    Raises:
-        ConfigError: if that is not possible, or it is the folder of the input.
-    """
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        trial = output / ".hudepth"
-        trial.write_bytes(b"")
-        trial.unlink()
-    except OSError as error:
-        raise ConfigError(f"output: cannot write to '{output}' ({error.strerror}). Pass output=<a folder>.") from error
+def _not_the_input(output: Path, inputs: Inputs) -> Path:
     folders = {item.path.parent.resolve() for item in (*inputs.images, *inputs.videos)}
     if output.resolve() in folders:
         raise ConfigError(f"output: '{output}' is the folder of the input. Pass another, output=<folder>.")
     return output
-
-
-def _listed(value: object) -> list[str]:
-    return [str(item) for item in value] if isinstance(value, list) else [str(value)]
 
 
 def _on_gpu(model: DepthModel) -> bool:

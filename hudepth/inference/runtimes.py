@@ -1,0 +1,63 @@
+"""How exported graphs are opened, once for predicting and for measuring. PyTorch is not imported here."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from hudepth.errors import ConfigError
+
+PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
+"""In which OpenVINO computes, and its own names of them; bfloat16 is not exact."""
+
+
+def onnx_session(path: Path, *, threads: int) -> Any:
+    """Open an ONNX file in ONNX Runtime, on the CPU.
+
+    Raises:
+        ConfigError: if ONNX Runtime is not installed.
+        Exception: whatever it says of a file that it cannot read.
+    """
+    runtime = package("onnxruntime", extra="onnx")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3  # errors
+    return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:
+    """Open an IR or ONNX file in OpenVINO, on the CPU.
+
+    Args:
+        path: ``.xml`` with its ``.bin`` beside it, or ``.onnx``.
+        threads: to compute with.
+        precision: of :data:`PRECISIONS`.
+
+    Returns:
+        The model as it was read, and a request that computes it.
+
+    Raises:
+        ConfigError: if OpenVINO is not installed.
+        Exception: whatever it says of a file that it cannot read.
+    """
+    core = package("openvino", extra="openvino").Core()
+    options = {
+        "PERFORMANCE_HINT": "LATENCY",
+        "INFERENCE_PRECISION_HINT": PRECISIONS[precision],
+        "INFERENCE_NUM_THREADS": threads,
+    }
+    model = core.read_model(path)
+    return model, core.compile_model(model, "CPU", options).create_infer_request()
+
+
+def package(name: str, *, extra: str) -> Any:
+    """Import a package that an extra of hudepth installs.
+
+    Raises:
+        ConfigError: if it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ConfigError(f"{name} is not installed. Run pip install 'hudepth[{extra}]'.") from error
