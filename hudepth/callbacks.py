@@ -183,8 +183,8 @@ class PanelPictures(Callback):
         self.folder, self.store, self.indices = folder, store, list(indices)
         self.every_n_epochs, self.max_depth_m = every_n_epochs, max_depth_m
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw, if it is time."""
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw, if it is time: while averaged weights, if there are, are still in their place."""
         epoch = trainer.current_epoch + 1
         due = epoch % self.every_n_epochs == 0 or epoch == trainer.max_epochs
         if trainer.sanity_checking or not trainer.is_global_zero or not due:
@@ -230,7 +230,16 @@ def evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
 
 
 class KeptCheckpoint(ModelCheckpoint):
-    """A ModelCheckpoint that still knows the best so far when the run directory was moved before it went on."""
+    """A ModelCheckpoint that still knows the best so far when the run directory was moved before it went on.
+
+    What is judged by a metric is judged only once the network trains at the size it will be used at.
+    """
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save, if it is time."""
+        data = getattr(trainer, "datamodule", None)
+        if self.monitor is None or data is None or data.train_size == data.size:
+            super().on_train_epoch_end(trainer, pl_module)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the state from a checkpoint, with the paths of where the run lies now."""

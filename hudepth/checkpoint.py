@@ -90,9 +90,17 @@ class Checkpoint:
             with torch.device("meta"):
                 self._check_fits(instantiate(model, only=only))
         net: nn.Module = instantiate(model, trust=trust, only=only)
+        self.fill(net)
+        return net.eval()
+
+    def fill(self, net: nn.Module) -> None:
+        """Give a network these tensors.
+
+        Raises:
+            CheckpointError: if they are not those of such a network.
+        """
         self._check_fits(net)
         net.load_state_dict(self.state)
-        return net.eval()
 
     def _check_fits(self, net: nn.Module) -> None:
         own, given = net.state_dict(), self.state

@@ -10,14 +10,17 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchmetrics import MetricCollection
 
 from hudepth import checkpoint as ckpt
+from hudepth.averaging import averaged_state
 from hudepth.errors import TrainingError
 from hudepth.metrics.collection import DepthMetrics, DepthSSIM
 from hudepth.metrics.depth import METRIC_NAMES
+from hudepth.schedules import StepSchedule
 from hudepth.types import Batch
 
 
@@ -31,8 +34,10 @@ class DepthModule(LightningModule):
         net: normalised image to unit depth.
         loss: called with prediction, unit depth, image and valid mask; returns :class:`hudepth.types.LossTerms`.
         max_depth_m: what unit depth 1 stands for.
-        optimizer: makes an optimiser from parameters.
-        scheduler: makes a learning-rate schedule, stepped once an epoch, from an optimiser; None for a constant rate.
+        optimizer: makes an optimiser from named parameters.
+        scheduler: makes a learning-rate schedule from an optimiser and the number of steps of the whole training: a
+            :class:`hudepth.schedules.StepSchedule` goes on after every step, others after every epoch. None for a
+            constant rate.
         record: what each checkpoint carries beside the weights: ``config`` and ``split``, plain types only.
     """
 
@@ -42,8 +47,8 @@ class DepthModule(LightningModule):
         loss: nn.Module,
         *,
         max_depth_m: float,
-        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer],
-        scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
+        scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
         record: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -80,7 +85,9 @@ class DepthModule(LightningModule):
         return [*(f"val/{name}" for name in (*METRIC_NAMES, "ssim", *terms)), *(f"train/{name}" for name in terms)]
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
-        pred = self(batch["image"])
+        pred = self(batch.get("small_image", batch["image"]))
+        if pred.shape != batch["unit_depth"].shape:  # scored against the truth at full size, whatever size it trains at
+            pred = functional.interpolate(pred, batch["unit_depth"].shape[-2:], mode="bilinear", align_corners=False)
         loss = self.loss(pred, batch["unit_depth"], batch["image"], batch["valid"])
         values = {f"{stage}/total": loss.total.detach(), **{f"{stage}/{k}": v.detach() for k, v in loss.terms.items()}}
         # The batch size as a float: over processes Lightning averages the count of images in the count's own type, and
@@ -124,14 +131,19 @@ class DepthModule(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, the schedule."""
-        optimizer = self._make_optimizer(self.parameters())
+        optimizer = self._make_optimizer(self.net.named_parameters())
         if self._make_scheduler is None:
             return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._make_scheduler(optimizer), "interval": "epoch"},
-        }
+        scheduler = self._make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+        interval = "step" if isinstance(scheduler, StepSchedule) else "epoch"
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the configuration and the split, so that a checkpoint needs nothing beside it."""
+        """Add the configuration and the split, so that a checkpoint needs nothing beside it.
+
+        If weights are averaged, a checkpoint holds the average.
+        """
+        averaged = averaged_state(self.trainer, checkpoint)
+        if averaged is not None:
+            checkpoint["state_dict"] = averaged
         checkpoint[ckpt.KEY] = {"version": ckpt.VERSION, **self._record}

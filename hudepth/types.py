@@ -32,6 +32,8 @@ class Batch(TypedDict):
     """True where the truth is measured."""
     index: Int[Tensor, " b"]
     """Position in the depth store."""
+    small_image: NotRequired[Float[Tensor, "b 3 h2 w2"]]
+    """Validation batches only, and only while the network trains at another size: ``image`` at that size."""
     native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]
     """Test batches only: truth at its native resolution [m], 0 where unmeasured."""
 

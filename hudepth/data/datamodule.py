@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
+from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor
+from torch.nn import functional
 from torch.utils.data import DataLoader, DistributedSampler
 
+from hudepth.data.augment import Augmentation, resize
 from hudepth.data.dataset import ShardSampler, StoreDataset, as_is
 from hudepth.data.prepare import prepare
+from hudepth.data.resolution import read_stages, size_at
 from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split, check_split, make_split
 from hudepth.data.store import DepthStore
@@ -32,8 +39,11 @@ class DepthDataModule(LightningDataModule):
         fractions: of train, val and test (the paper: 70 / 10 / 20 %).
         max_depth_m: depth is clipped to it and divided by it (the paper: 10 m).
         batch_size: pairs per step (the paper: 8).
+        progressive: sizes to begin with, each until a share of the epochs is over, as ``[{size: [112, 112], until: 0.4}]``;
+            then comes ``size``.
+        augment: changes training pairs at random; None leaves them as they are.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
-        seed: of the order of training pairs, which depends on nothing but this and the epoch.
+        seed: of the order of training pairs and of augmentation, which depend on nothing but this and the epoch.
         cache: folder of the depth stores.
         native: keep native-resolution truth in the store, for protocols like ``eigen``.
         on_error: ``raise`` at a bad pair or ``skip`` it.
@@ -53,6 +63,8 @@ class DepthDataModule(LightningDataModule):
         fractions: Sequence[float] = (0.7, 0.1, 0.2),
         max_depth_m: float = 10.0,
         batch_size: int = 8,
+        progressive: Sequence[Mapping[str, Any]] | None = None,
+        augment: Augmentation | None = None,
         num_workers: int = 0,
         seed: int = 42,
         cache: str | Path = "~/.cache/hudepth",
@@ -75,6 +87,9 @@ class DepthDataModule(LightningDataModule):
             raise ConfigError(f"data.max_depth_m: {max_depth_m} is not a positive number of metres.")
         self.source = source
         self.size = (int(size[0]), int(size[1]))
+        self.stages = read_stages(progressive or [], size=self.size)
+        self.augment = augment
+        self._draws: tuple[int, torch.Generator] | None = None
         self.split_kind, self.split_seed, self.fractions = split, split_seed, tuple(fractions)
         self.max_depth_m = float(max_depth_m)
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
@@ -132,9 +147,51 @@ class DepthDataModule(LightningDataModule):
         """Test batches, in the split's order, with native-resolution truth where the store has it."""
         return self._evaluation_loader(StoreDataset(self.store, self.split.test, native=self.store.has_native))
 
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """All sizes (height, width) that a training goes through, the last one is that of the store."""
+        return [*(stage.size for stage in self.stages), self.size]
+
+    @property
+    def train_size(self) -> tuple[int, int]:
+        """The (height, width) of training images in the current epoch."""
+        epoch, epochs = (0, None) if self.trainer is None else (self.trainer.current_epoch, self.trainer.max_epochs)
+        return size_at(self.stages, epoch, epochs=epochs, final=self.size)
+
     def on_after_batch_transfer(self, batch: RawBatch, dataloader_idx: int) -> Batch:
-        """Normalise on the device, which spares the transfer three quarters of its bytes."""
-        return preprocess(batch, max_depth_m=self.max_depth_m)
+        """Normalise on the device, which spares the transfer three quarters of its bytes; augment training batches.
+
+        While training at a smaller size than the store's, validation batches bring the image at that size, too.
+        """
+        training = self.trainer is not None and self.trainer.training
+        if training:
+            return preprocess(
+                batch,
+                max_depth_m=self.max_depth_m,
+                size=self.train_size,
+                augment=None if self.augment is None else partial(
+                    self.augment, aspect=self._aspect, generator=self._generator()
+                ),
+            )
+        result = preprocess(batch, max_depth_m=self.max_depth_m)
+        if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING and self.train_size != self.size:
+            result["small_image"] = functional.interpolate(result["image"], self.train_size, mode="area")
+        return result
+
+    @property
+    def _aspect(self) -> float:
+        """Width over height of what the training images show, whatever shape they were resized to."""
+        height, width = next(iter(self.store.info.get("native_sizes") or []), self.size)
+        return float(width / height)
+
+    def _generator(self) -> torch.Generator:
+        """Return the source of augmentation's draws: it begins anew each epoch, so that a resumed run draws the same."""
+        assert self.trainer is not None
+        epoch, rank = self.trainer.current_epoch, self.trainer.global_rank
+        if self._draws is None or self._draws[0] != epoch:
+            seed = int.from_bytes(hashlib.sha256(f"augment {self.seed} {epoch} {rank}".encode()).digest()[:7])
+            self._draws = (epoch, torch.Generator().manual_seed(seed))
+        return self._draws[1]
 
     def _evaluation_loader(self, dataset: StoreDataset) -> DataLoader[RawBatch]:
         rank, world_size = self._shard()
@@ -155,19 +212,29 @@ class DepthDataModule(LightningDataModule):
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
 
 
-def preprocess(batch: RawBatch, *, max_depth_m: float) -> Batch:
-    """Normalise what the loader read: ImageNet statistics for the image; depth clipped, divided, masked.
+def preprocess(
+    batch: RawBatch,
+    *,
+    max_depth_m: float,
+    size: tuple[int, int] | None = None,
+    augment: Callable[..., tuple[Tensor, Tensor]] | None = None,
+) -> Batch:
+    """Normalise what the loader read: ImageNet statistics for the image; depth divided, clipped, masked.
 
     Args:
         batch: RGB bytes and millimetres.
         max_depth_m: depth is clipped to it and divided by it.
+        size: (height, width) of the result; default: as it is.
+        augment: changes the image in [0, 1] and the unit depth, and brings them to ``size``.
     """
-    image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format)
-    depth_mm = batch["depth_mm"].to(torch.float32)[:, None]
+    image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format) / 255
+    unit_depth = batch["depth_mm"].to(torch.float32)[:, None] / (1000 * max_depth_m)
+    size = size or (image.shape[-2], image.shape[-1])
+    image, unit_depth = (augment or resize)(image, unit_depth, size=size)
     result = Batch(
-        image=normalise_image(image / 255),
-        unit_depth=(depth_mm / (1000 * max_depth_m)).clamp_(max=1),
-        valid=depth_mm > 0,
+        image=normalise_image(image),
+        unit_depth=unit_depth.clamp(max=1),
+        valid=unit_depth > 0,
         index=batch["index"],
     )
     if "native_depth" in batch:

@@ -4,5 +4,7 @@ from __future__ import annotations
 
 from hudepth.losses.badcl import BADCL
 from hudepth.losses.baselines import L1, L2, BerHu, SILog
+from hudepth.losses.gradients import GradientMatching
+from hudepth.losses.mixture import Mixture
 
-__all__ = ["BADCL", "L1", "L2", "BerHu", "SILog"]
+__all__ = ["BADCL", "L1", "L2", "BerHu", "GradientMatching", "Mixture", "SILog"]

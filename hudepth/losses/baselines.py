@@ -52,6 +52,15 @@ def berhu_loss(
     return masked_mean(torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)), valid)
 
 
+def log_difference(
+    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """Return ln pred - ln target, 0 where not valid. Depths below :data:`MIN_UNIT_DEPTH` count as that."""
+    pred = torch.where(valid, pred, 1.0).clamp_min(MIN_UNIT_DEPTH)
+    target = torch.where(valid, target, 1.0).clamp_min(MIN_UNIT_DEPTH)
+    return pred.log() - target.log()
+
+
 def silog_loss(
     pred: Float[Tensor, "b 1 h w"],
     target: Float[Tensor, "b 1 h w"],
@@ -66,9 +75,7 @@ def silog_loss(
     :data:`MIN_UNIT_DEPTH` count as that. ``variance_focus`` is in [0, 1]: 0 leaves the RMSE of logs, 1
     forgives any common scale.
     """
-    pred = torch.where(valid, pred, 1.0).clamp_min(MIN_UNIT_DEPTH)
-    target = torch.where(valid, target, 1.0).clamp_min(MIN_UNIT_DEPTH)
-    g = pred.log() - target.log()
+    g = log_difference(pred, target, valid)
     mean = masked_mean(g, valid)
     # the same as mean(g^2) - variance_focus * mean^2, but a sum of squares: rounding cannot make it negative
     radicand = masked_mean((g - mean).square(), valid) + (1 - variance_focus) * mean.square()

@@ -1,4 +1,9 @@
-"""The decoder of table A1: up blocks that join a coarse map with a skip, and the head that ends in unit depth."""
+"""The decoder of table A1: up blocks that join a coarse map with a skip, and the head that ends in unit depth.
+
+Two of its steps are linear and follow each other with nothing between them: upsampling and convolution, and the head's
+two convolutions. Each pair is one smaller convolution, whose weights are sums of the original ones. ``arithmetic`` says
+which is computed; the parameters, and but for rounding the results and gradients, are the same.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 UpsampleMode = Literal["nearest", "bilinear"]
+Arithmetic = Literal["plain", "merged"]
+
+ARITHMETIC = ("plain", "merged")
+"""``plain``: step by step, as table A1 lists them. ``merged``: linear steps that follow each other as one."""
 
 
 class UpBlock(nn.Module):
@@ -20,13 +29,21 @@ class UpBlock(nn.Module):
         channels_skip: of the skip, which has twice the coarse map's size.
         channels_out: of the result.
         upsample: ``nearest`` (what figure 4's UpSampling2D does by default) or ``bilinear``.
+        arithmetic: one of :data:`ARITHMETIC`; bilinear upsampling is always ``plain``.
     """
 
     def __init__(
-        self, channels_in: int, channels_skip: int, channels_out: int, *, upsample: UpsampleMode = "nearest"
+        self,
+        channels_in: int,
+        channels_skip: int,
+        channels_out: int,
+        *,
+        upsample: UpsampleMode = "nearest",
+        arithmetic: Arithmetic = "plain",
     ) -> None:
         super().__init__()
         self.upsample = upsample
+        self.merged = arithmetic == "merged" and upsample == "nearest"
         self.channels_in = channels_in
         self.conv1 = nn.Conv2d(channels_in + channels_skip, channels_out, 3, padding=1)
         self.bn1 = nn.BatchNorm2d(channels_out)
@@ -38,9 +55,102 @@ class UpBlock(nn.Module):
         self, x: Float[Tensor, "b c_in h w"], skip: Float[Tensor, "b c_skip h2 w2"]
     ) -> Float[Tensor, "b c_out h2 w2"]:
         """Return a map of the skip's size."""
-        align = {"align_corners": False} if self.upsample == "bilinear" else {}
-        x = functional.interpolate(x, scale_factor=2.0, mode=self.upsample, **align)
-        x = torch.cat([x, skip], dim=1)
-        x = self.relu(self.bn1(self.conv1(x)))
+        x = self._merged_conv1(x, skip) if self.merged else self._plain_conv1(x, skip)
+        x = self.relu(self.bn1(x))
         x = self.relu(self.bn2(self.conv2(x)))
         return x
+
+    def _plain_conv1(self, x: Tensor, skip: Tensor) -> Tensor:
+        align = {"align_corners": False} if self.upsample == "bilinear" else {}
+        x = functional.interpolate(x, scale_factor=2.0, mode=self.upsample, **align)
+        result: Tensor = self.conv1(torch.cat([x, skip], dim=1))
+        return result
+
+    def _merged_conv1(self, x: Tensor, skip: Tensor) -> Tensor:
+        coarse, fine = split_kernel(self.conv1.weight, channels_in=self.channels_in)
+        x = functional.conv_transpose2d(x, coarse, self.conv1.bias, stride=2, padding=1)
+        return x + functional.conv2d(skip, fine, padding=1)
+
+
+def split_kernel(
+    weight: Float[Tensor, "c_out c_both 3 3"], *, channels_in: int
+) -> tuple[Float[Tensor, "c_in c_out 4 4"], Float[Tensor, "c_out c_skip 3 3"]]:
+    """Split the kernel that an up block applies to (doubled coarse map, skip) so that nothing need be doubled.
+
+    Doubled by nearest neighbour and then convolved by 3 x 3, each output pixel sees only 2 x 2 different pixels of the
+    coarse map: a transposed convolution of 4 x 4 with stride 2, with 4/9 of the multiplications. The concatenation
+    becomes a sum of two convolutions.
+
+    Args:
+        weight: of the convolution.
+        channels_in: how many of its input channels are the coarse map's; they come first.
+
+    Returns:
+        The kernel of the transposed convolution (stride 2, padding 1) and that of the skip's convolution (padding 1).
+    """
+    coarse = weight[:, :channels_in]
+    for dim in (2, 3):
+        a, b, c = coarse.unbind(dim)  # taps on a doubled line
+        coarse = torch.stack([c, b + c, a + b, a], dim)
+    return coarse.transpose(0, 1), weight[:, channels_in:]
+
+
+def is_usual_head(up: nn.ConvTranspose2d, head: nn.Conv2d) -> bool:
+    """Whether these are layers that :func:`joint_head` can join."""
+    return (
+        (up.kernel_size, up.stride, up.padding) == ((4, 4), (2, 2), (1, 1))
+        and (head.kernel_size, head.stride, head.padding, head.out_channels) == ((3, 3), (1, 1), (1, 1), 1)
+        and up.bias is not None
+        and head.bias is not None
+    )
+
+
+def joint_head(
+    up_weight: Float[Tensor, "c_in c_mid 4 4"],
+    up_bias: Float[Tensor, " c_mid"],
+    head_weight: Float[Tensor, "1 c_mid 3 3"],
+    head_bias: Float[Tensor, " 1"],
+) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
+    """Join a transposed convolution (stride 2, padding 1) and the 3 x 3 convolution to one channel that follows it.
+
+    Each 2 x 2 square of the result is a linear function of 3 x 3 pixels of the input: a convolution to 4 channels,
+    which :func:`torch.nn.functional.pixel_shuffle` lays out as squares. Right everywhere but on the outermost pixels,
+    where the original pads what lies between the two steps.
+
+    Returns:
+        Kernel and bias of the joint convolution (padding 1).
+    """
+    # output pixel 2 i + phase, of input pixel i + t, goes through tap m = phase + 2 - 2 t of the joint kernel
+    joint = up_weight.new_zeros(len(up_weight), 6, 6)
+    for row in range(3):
+        for column in range(3):
+            tap = torch.einsum("iokl,o->ikl", up_weight, head_weight[0, :, row, column])
+            joint = joint + functional.pad(tap, (2 - column, column, 2 - row, row))
+    phases = joint.reshape(-1, 3, 2, 3, 2).flip(1, 3).permute(2, 4, 0, 1, 3).flatten(0, 1)
+    return phases, (head_weight[0].sum((1, 2)) @ up_bias + head_bias).expand(4)
+
+
+def run_head(
+    up: nn.ConvTranspose2d,
+    head: nn.Conv2d,
+    x: Float[Tensor, "b c h w"],
+    *,
+    joint: tuple[Tensor, Tensor],
+) -> Float[Tensor, "b 1 2*h 2*w"]:
+    """Return ``head(up(x))`` by the joint convolution, and by the two steps along the border, on strips of two pixels.
+
+    Args:
+        up: the first step.
+        head: the second.
+        x: the last up block's map.
+        joint: what :func:`joint_head` makes of them.
+    """
+
+    def steps(strip: Tensor) -> Tensor:
+        result: Tensor = head(up(strip))
+        return result
+
+    inside = functional.pixel_shuffle(functional.conv2d(x, *joint, padding=1), 2)[:, :, 1:-1, 1:-1]
+    top, bottom = steps(x[:, :, :2])[:, :, :1], steps(x[:, :, -2:])[:, :, -1:]
+    left, right = steps(x[..., :2])[:, :, 1:-1, :1], steps(x[..., -2:])[:, :, 1:-1, -1:]
+    return torch.cat([top, torch.cat([left, inside, right], dim=3), bottom], dim=2)

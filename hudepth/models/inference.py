@@ -12,11 +12,10 @@ import itertools
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hudepth.console import log
-from hudepth.models.decoder import UpBlock
+from hudepth.models.decoder import UpBlock, is_usual_head, joint_head, run_head, split_kernel
 
 TOLERANCE = 1e-5
 """How far the rewritten network's unit depth may be from the original's; 0.1 mm where unit depth 1 is 10 m."""
@@ -69,22 +68,12 @@ def _merge_linear_steps(net: nn.Module) -> None:
             if isinstance(child, UpBlock) and child.upsample == "nearest" and isinstance(child.bn1, nn.Identity):
                 setattr(module, name, MergedUpBlock(child))
         up, head = getattr(module, "head_up", None), getattr(module, "head", None)
-        if isinstance(up, nn.ConvTranspose2d) and isinstance(head, nn.Conv2d) and _is_usual_head(up, head):
+        if isinstance(up, nn.ConvTranspose2d) and isinstance(head, nn.Conv2d) and is_usual_head(up, head):
             module.head_up, module.head = nn.Identity(), MergedHead(up, head)
 
 
-def _is_usual_head(up: nn.ConvTranspose2d, head: nn.Conv2d) -> bool:
-    return (up.kernel_size, up.stride, up.padding) == ((4, 4), (2, 2), (1, 1)) and (
-        (head.kernel_size, head.stride, head.padding, head.out_channels) == ((3, 3), (1, 1), (1, 1), 1)
-    )
-
-
 class MergedUpBlock(nn.Module):
-    """An up block of which the coarse map is never upsampled: 4/9 of the multiplications of that half.
-
-    Doubled by nearest neighbour and then convolved by 3 x 3, each output pixel sees only 2 x 2 different pixels of the
-    coarse map: a transposed convolution of 4 x 4 with stride 2, whose weights are sums of the original ones. The
-    concatenation becomes a sum of two convolutions.
+    """An up block of which the coarse map is never upsampled (:func:`hudepth.models.decoder.split_kernel`).
 
     Args:
         block: with nearest upsampling and batch norm folded.
@@ -92,9 +81,7 @@ class MergedUpBlock(nn.Module):
 
     def __init__(self, block: UpBlock) -> None:
         super().__init__()
-        weight = block.conv1.weight.detach().double()
-        coarse, skip = weight[:, : block.channels_in], weight[:, block.channels_in :]
-        coarse = _double_kernel(_double_kernel(coarse, dim=2), dim=3).transpose(0, 1)
+        coarse, skip = split_kernel(block.conv1.weight.detach().double(), channels_in=block.channels_in)
         channels = block.conv1.out_channels
         self.coarse = nn.ConvTranspose2d(coarse.shape[0], channels, 4, stride=2, padding=1)
         self.skip = nn.Conv2d(skip.shape[1], channels, 3, padding=1, bias=False)
@@ -117,18 +104,8 @@ class MergedUpBlock(nn.Module):
         return x
 
 
-def _double_kernel(weight: Tensor, *, dim: int) -> Tensor:
-    """Turn taps (a, b, c) on a doubled line into those of a transposed convolution: (c, b + c, a + b, a)."""
-    a, b, c = weight.unbind(dim)
-    return torch.stack([c, b + c, a + b, a], dim)
-
-
 class MergedHead(nn.Module):
-    """Transposed convolution to 32 channels and 3 x 3 convolution to one, with nothing between them, as one step.
-
-    Each 2 x 2 square of the result is a linear function of 3 x 3 pixels of the input: a convolution to 4 channels,
-    which are then laid out as squares. Along the border the original convolution pads what lies between the two steps,
-    so there, and only there, the original steps run, on strips two pixels wide.
+    """The head's two convolutions as one (:func:`hudepth.models.decoder.joint_head`).
 
     Args:
         up: kernel 4, stride 2, padding 1.
@@ -138,29 +115,16 @@ class MergedHead(nn.Module):
     def __init__(self, up: nn.ConvTranspose2d, head: nn.Conv2d) -> None:
         super().__init__()
         self.up, self.head = up, head
-        first, second = up.weight.detach().double(), head.weight.detach().double()[0]
-        # output pixel 2 i + phase, of input pixel i + t, goes through tap m = phase + 2 - 2 t of the joint kernel
-        joint = first.new_zeros(up.in_channels, 6, 6)
-        for row in range(3):
-            for column in range(3):
-                tap = torch.einsum("iokl,o->ikl", first, second[:, row, column])
-                joint[:, 2 - row : 6 - row, 2 - column : 6 - column] += tap
-        phases = joint.reshape(-1, 3, 2, 3, 2).flip(1, 3).permute(2, 4, 0, 1, 3).flatten(0, 1)
-        bias = second.sum((1, 2)) @ up.bias.detach().double() if up.bias is not None else first.new_zeros(())
+        double = (t.detach().double() for t in (up.weight, up.bias, head.weight, head.bias) if t is not None)
+        weight, bias = joint_head(*double)
         self.joint = nn.Conv2d(up.in_channels, 4, 3, padding=1)
         assert self.joint.bias is not None
         with torch.no_grad():
-            self.joint.weight.copy_(phases)
-            self.joint.bias.copy_(bias + (head.bias.detach().double() if head.bias is not None else 0))
+            self.joint.weight.copy_(weight)
+            self.joint.bias.copy_(bias)
         self.requires_grad_(requires_grad=False)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 2*h 2*w"]:
         """Return what ``head(up(x))`` returns."""
-        inside = functional.pixel_shuffle(self.joint(x), 2)[:, :, 1:-1, 1:-1]
-        top, bottom = self._steps(x[:, :, :2])[:, :, :1], self._steps(x[:, :, -2:])[:, :, -1:]
-        left, right = self._steps(x[..., :2])[:, :, 1:-1, :1], self._steps(x[..., -2:])[:, :, 1:-1, -1:]
-        return torch.cat([top, torch.cat([left, inside, right], dim=3), bottom], dim=2)
-
-    def _steps(self, strip: Tensor) -> Tensor:
-        result: Tensor = self.head(self.up(strip))
-        return result
+        assert self.joint.bias is not None
+        return run_head(self.up, self.head, x, joint=(self.joint.weight, self.joint.bias))

@@ -16,12 +16,16 @@ from torch import Tensor, nn
 
 from hudepth.console import log
 from hudepth.errors import CheckpointError, did_you_mean
+from hudepth.models.options import choose
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 """torchvision's ResNet18_Weights.IMAGENET1K_V1; the name carries the first digits of the file's sha256."""
 
 LAYER4 = "layer4."
 """Prefix of the layer that table A1 leaves out."""
+
+NORMS = {"trained": False, "frozen": True}
+"""Values of ``model.trunk_norm``: whether batch norm keeps the statistics it starts with."""
 
 CLASSIFIER = "fc."
 """Prefix of the part of a full ResNet-18 file that no trunk has."""
@@ -69,13 +73,17 @@ class ResNet18Trunk(nn.Module):
         weights: ``imagenet`` (torchvision's file, downloaded once and checked by its hash), the path of a file with
             torchvision's parameter names, or ``none`` for random values.
         layers: 3 ends with layer3 (table A1), 4 with layer4 (the paper's text).
+        norm: batch norm: ``trained``, or ``frozen``: normalise by the statistics of the start, in training too. Its
+            scale and shift are trained either way.
 
     Raises:
+        ConfigError: for an unknown ``norm``.
         CheckpointError: if the weights cannot be had or do not fit.
     """
 
-    def __init__(self, *, weights: str | None = None, layers: Literal[3, 4] = 3) -> None:
+    def __init__(self, *, weights: str | None = None, layers: Literal[3, 4] = 3, norm: str = "trained") -> None:
         super().__init__()
+        self.norm_frozen = choose("model.trunk_norm", norm, NORMS)
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
@@ -91,6 +99,15 @@ class ResNet18Trunk(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         if weights not in (None, "none"):
             load_trunk_weights(self, weights)
+
+    def train(self, mode: bool = True) -> ResNet18Trunk:  # noqa: FBT001, FBT002 - nn.Module's signature
+        """Switch to training mode, but for batch norm if that is frozen."""
+        super().train(mode)
+        if self.norm_frozen:
+            for module in self.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.eval()
+        return self
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Features:
         """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size, and at 1/32 with layer4."""

@@ -68,8 +68,8 @@ class ResNet18UNet(nn.Module):
         self.up3 = UpBlock(128, 64, 64, upsample=upsample)
         self.up4 = UpBlock(64, 64, 64, upsample=upsample)
         self.head_up = nn.ConvTranspose2d(64, 32, 4, stride=2, padding=1)
-        self.head = nn.Conv2d(32, 1, 3, padding=1)
         self.output = choose("model.output", output, OUTPUTS)()
+        self.head = nn.Conv2d(32, getattr(self.output, "channels_in", 1), 3, padding=1)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Predict unit depth.

@@ -43,14 +43,23 @@ def check_config(config: dict[str, Any]) -> None:
 
 
 @torch.inference_mode()
-def check_input(net: nn.Module, size: tuple[int, int]) -> None:
-    """Show the network one image of this size, before hours go into preparing others.
+def check_input(net: nn.Module, sizes: list[tuple[int, int]]) -> None:
+    """Show the network one image of each size that it will see, before hours go into preparing others.
+
+    Args:
+        net: of the training.
+        sizes: (height, width) of the training's stages; the last one is ``data.size``.
 
     Raises:
-        HudepthError: the network's own, if it cannot take it.
+        HudepthError: the network's own, if it cannot take one.
     """
     net.eval()
-    net(torch.zeros(1, 3, *size))
+    for number, size in enumerate(sizes):
+        try:
+            net(torch.zeros(1, 3, *size))
+        except ConfigError as error:
+            key = "data.size" if size == sizes[-1] else f"data.progressive[{number}].size"
+            raise ConfigError(str(error).replace("data.size", key)) from error
     net.train()
 
 

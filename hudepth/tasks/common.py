@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from hudepth.data.augment import Augmentation
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.sources.base import Source
 from hudepth.errors import ConfigError
@@ -30,8 +31,15 @@ def without_known_warnings() -> Iterator[None]:
         yield
 
 
-def build_data(data: Mapping[str, Any], *, trust: list[str]) -> DepthDataModule:
+def build_data(
+    data: Mapping[str, Any], *, trust: list[str], augment: Mapping[str, Any] | None = None
+) -> DepthDataModule:
     """Build the data module that the ``data`` part of a configuration describes.
+
+    Args:
+        data: the part.
+        trust: further modules whose classes may be named.
+        augment: the part of that name; only training uses it.
 
     Raises:
         ConfigError: if it cannot be built.
@@ -41,8 +49,14 @@ def build_data(data: Mapping[str, Any], *, trust: list[str]) -> DepthDataModule:
     given = {key: data[key] for key in SOURCE_KEYS if key in data}
     source = instantiate(data["source"], trust=trust, only=Source, **given)
     options = {key: value for key, value in data.items() if key not in (*SOURCE_KEYS, "source")}
-    datamodule: DepthDataModule = instantiate(options, source, trust=trust, only=DepthDataModule)
+    given = {"augment": instantiate(augment, trust=trust, only=Augmentation)} if is_given(augment) else {}
+    datamodule: DepthDataModule = instantiate(options, source, trust=trust, only=DepthDataModule, **given)
     return datamodule
+
+
+def is_given(part: Mapping[str, Any] | None) -> bool:
+    """Whether a part of a configuration that may be left out names something to build."""
+    return bool(part and part.get("_target_"))
 
 
 def build_protocols(protocols: Mapping[str, Any], *, datamodule: DepthDataModule, trust: list[str]) -> list[Protocol]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +72,20 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
             )
         OmegaConf.update(resumed, key, OmegaConf.from_dotlist([f"value={value}"])["value"], force_add=True)
     result = plain(resumed)
-    if "T_max" in (config["schedule"] or {}) and result["trainer"].get("max_epochs") != epochs:
+    if result["trainer"].get("max_epochs") != epochs and (why := _bound_to_length(config)):
         raise ConfigError(
-            f"resume: the cosine schedule of this run ends at epoch {config['schedule']['T_max']}, so "
-            "trainer.max_epochs cannot change. Start a new run, or use schedule=constant."
+            f"resume: {why} of this run is laid out over {epochs} epochs, so trainer.max_epochs cannot change. "
+            "Start a new run, or use schedule=constant and data.progressive=null from the start."
         )
     return result
+
+
+def _bound_to_length(config: Mapping[str, Any]) -> str:
+    """Name the part of a run's configuration that depends on how long it trains, if there is one."""
+    schedule = config["schedule"] or {}
+    if "T_max" in schedule or str(schedule.get("_target_")).startswith("hudepth.schedules."):
+        return "the learning-rate schedule"
+    if config["data"].get("progressive"):
+        return "the progressive resolution"
+    freezes = [extra for extra in config["callbacks"].get("extra") or [] if "FreezeTrunk" in str(extra.get("_target_"))]
+    return "FreezeTrunk" if freezes else ""

@@ -29,8 +29,9 @@ from hudepth.data.splits import load_split, save_split
 from hudepth.errors import ConfigError, HudepthError, Pruned
 from hudepth.instantiate import instantiate
 from hudepth.module import DepthModule
+from hudepth.schedules import StepSchedule
 from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, check_monitor
-from hudepth.tasks.common import build_data, build_protocols, without_known_warnings
+from hudepth.tasks.common import build_data, build_protocols, is_given, without_known_warnings
 from hudepth.tasks.config import plain
 from hudepth.tasks.devices import check_shares
 from hudepth.tasks.resume import resumed_config
@@ -165,14 +166,16 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     log.info("run directory: %s", path)
     seed_everything(config["seed"], verbose=False)
     trust = list(config["trust"])
-    datamodule = build_data(config["data"], trust=trust)
+    datamodule = build_data(config["data"], trust=trust, augment=config.get("augment"))
     if datamodule.source.name == "rooms":
         log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
     if config["test"]:  # a wrong protocol should not be found after hours
         build_protocols(config["protocol"], datamodule=datamodule, trust=trust)
     net = instantiate(config["model"], trust=trust, only=nn.Module)
     net.to(memory_format=MEMORY_FORMATS[config.get("memory_format", "contiguous")])
-    check_input(net, datamodule.size)
+    check_input(net, datamodule.sizes)
+    if config.get("init") and resumed is None:
+        start_from(net, config["init"])
     split_file = path / "split.json"
     if resumed is not None and split_file.exists():
         datamodule.split = load_split(split_file, datamodule.store.records)
@@ -210,6 +213,21 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     return None if score is None else float(score)
 
 
+def start_from(net: nn.Module, spec: str) -> None:
+    """Give a network the weights of a checkpoint to begin with.
+
+    Args:
+        net: to be filled.
+        spec: a run, a checkpoint or a bundle, as for ``checkpoint=`` of the other verbs.
+
+    Raises:
+        CheckpointError: if there is no such checkpoint, or it is of another network.
+    """
+    checkpoint = load_checkpoint(spec)
+    checkpoint.fill(net)
+    log.info("init: weights of '%s', epoch %d", checkpoint.path, checkpoint.epoch)
+
+
 def build_module(
     config: dict[str, Any], net: nn.Module, datamodule: DepthDataModule, *, trust: list[str]
 ) -> DepthModule:
@@ -218,14 +236,19 @@ def build_module(
     Raises:
         HudepthError: if a part cannot be built.
     """
-    schedule = config["schedule"]
-    scheduled = schedule and schedule.get("_target_")
+
+    def schedule(optimizer: Optimizer, total_steps: int) -> LRScheduler:
+        knows_length = str(config["schedule"]["_target_"]).startswith(f"{StepSchedule.__module__}.")
+        extra = {"total_steps": total_steps} if knows_length else {}
+        built: LRScheduler = instantiate(config["schedule"], optimizer, trust=trust, only=LRScheduler, **extra)
+        return built
+
     return DepthModule(
         net,
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
         optimizer=partial(instantiate, config["optim"], trust=trust, only=Optimizer),
-        scheduler=partial(instantiate, schedule, trust=trust, only=LRScheduler) if scheduled else None,
+        scheduler=schedule if is_given(config["schedule"]) else None,
         record={
             "config": config,
             "split": datamodule.split.summary(),

@@ -28,6 +28,7 @@ from hudepth.instantiate import instantiate
 from hudepth.tasks.devices import build_trainer
 from hudepth.tasks.pruning import TrialPruner
 from hudepth.tasks.search import TRIAL_ENV
+from hudepth.times import Times
 
 
 def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthDataModule) -> list[Callback]:
@@ -43,7 +44,12 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
     """
     options = config["callbacks"]
     monitor, mode = config["monitor"], config["mode"]
-    callbacks: list[Callback] = [Interrupt(), History(path / "metrics.csv"), EpochLine(monitor)]
+    callbacks: list[Callback] = [
+        Interrupt(),
+        History(path / "metrics.csv"),
+        Times(path / "times.csv"),
+        EpochLine(monitor),
+    ]
     if options["panels"]:
         callbacks.append(
             PanelPictures(

@@ -1,0 +1,59 @@
+"""A weighted sum of other losses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hudepth.errors import ConfigError
+from hudepth.types import LossTerms
+
+
+class Mixture(nn.Module):
+    """Several losses, each with a weight; their terms are logged side by side.
+
+    Args:
+        losses: by name.
+        weights: of each; a loss of weight 0 is not computed.
+
+    Raises:
+        ConfigError: if the names differ, a weight is negative or not finite, or all are 0.
+    """
+
+    def __init__(self, *, losses: Mapping[str, nn.Module], weights: Mapping[str, float]) -> None:
+        super().__init__()
+        for name in weights:
+            if name not in losses:
+                raise ConfigError(f"loss.weights.{name}: there is no loss of this name; loss.losses has {list(losses)}.")
+        for name in losses:
+            if name not in weights:
+                raise ConfigError(f"loss.weights: none for '{name}'. Pass loss.weights.{name}=1, or 0 to leave it out.")
+            if not (math.isfinite(weights[name]) and weights[name] >= 0):
+                raise ConfigError(f"loss.weights.{name}: {weights[name]} is not a number of at least 0.")
+        self.weights = {name: float(weight) for name, weight in weights.items() if weight}
+        if not self.weights:
+            raise ConfigError(f"loss.weights: {', '.join(losses)} all have weight 0. Give one a positive weight.")
+        self.losses = nn.ModuleDict({name: losses[name] for name in self.weights})
+
+    def forward(
+        self,
+        pred: Float[Tensor, "b 1 h w"],
+        target: Float[Tensor, "b 1 h w"],
+        image: Float[Tensor, "b 3 h w"],
+        valid: Bool[Tensor, "b 1 h w"],
+    ) -> LossTerms:
+        """Return the weighted sum of the losses' totals, and all their terms.
+
+        Args:
+            pred: unit depth in [0, 1].
+            target: unit depth in [0, 1]; ignored where not valid.
+            image: RGB, ImageNet-normalised.
+            valid: True where the truth is measured.
+        """
+        parts = {name: loss(pred, target, image, valid) for name, loss in self.losses.items()}
+        total = torch.stack([self.weights[name] * part.total for name, part in parts.items()]).sum()
+        return LossTerms(total, {name: term for part in parts.values() for name, term in part.terms.items()})
