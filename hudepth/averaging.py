@@ -38,7 +38,7 @@ class EMA(WeightAveraging):
         steps = self._latest_update_step  # not ``count``, which lies on the device: reading it would wait for that
         share = 1 - min(self.decay, (1 + steps) / (10 + steps))
         if averaged[0].is_floating_point():
-            torch._foreach_lerp_(averaged, current, share)
+            torch._foreach_lerp_(list(averaged), list(current), share)
         else:  # counters
             for mean, now in zip(averaged, current, strict=True):
                 mean.copy_(now)

@@ -18,6 +18,7 @@ from torchmetrics import MetricCollection
 from hudepth import checkpoint as ckpt
 from hudepth.averaging import averaged_state
 from hudepth.errors import TrainingError
+from hudepth.losses.distillation import Distillation
 from hudepth.metrics.collection import DepthMetrics, DepthSSIM
 from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.schedules import StepSchedule
@@ -38,6 +39,7 @@ class DepthModule(LightningModule):
         scheduler: makes a learning-rate schedule from an optimiser and the number of steps of the whole training: a
             :class:`hudepth.schedules.StepSchedule` goes on after every step, others after every epoch. None for a
             constant rate.
+        distill: distance from a teacher's depths, added to the loss of training batches that bring some.
         record: what each checkpoint carries beside the weights: ``config`` and ``split``, plain types only.
     """
 
@@ -49,11 +51,13 @@ class DepthModule(LightningModule):
         max_depth_m: float,
         optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
         scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
+        distill: Distillation | None = None,
         record: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.net = net
         self.loss = loss
+        self.distill = distill
         self.max_depth_m = max_depth_m
         self.val_metrics = MetricCollection(
             {"depth": DepthMetrics(), "ssim": DepthSSIM(data_range=max_depth_m)}, prefix="val/", compute_groups=False
@@ -82,14 +86,22 @@ class DepthModule(LightningModule):
         """Return the names of all that is logged for an epoch; the loss is asked for its terms."""
         depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
         terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
-        return [*(f"val/{name}" for name in (*METRIC_NAMES, "ssim", *terms)), *(f"train/{name}" for name in terms)]
+        return [
+            *(f"val/{name}" for name in (*METRIC_NAMES, "ssim", *terms)),
+            *(f"train/{name}" for name in (*terms, *(["distill"] if self.distill else []))),
+        ]
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         pred = self(batch.get("small_image", batch["image"]))
         if pred.shape != batch["unit_depth"].shape:  # scored against the truth at full size, whatever size it trains at
             pred = functional.interpolate(pred, batch["unit_depth"].shape[-2:], mode="bilinear", align_corners=False)
         loss = self.loss(pred, batch["unit_depth"], batch["image"], batch["valid"])
-        values = {f"{stage}/total": loss.total.detach(), **{f"{stage}/{k}": v.detach() for k, v in loss.terms.items()}}
+        total: Tensor = loss.total
+        terms = dict(loss.terms)
+        if self.distill is not None and "teacher" in batch:
+            terms["distill"] = self.distill(pred, batch["teacher"])
+            total = total + self.distill.weight * terms["distill"]
+        values = {f"{stage}/total": total.detach(), **{f"{stage}/{k}": v.detach() for k, v in terms.items()}}
         # The batch size as a float: over processes Lightning averages the count of images in the count's own type, and
         # of 7 images in two processes it would make 3 a process, which is a loss too high by a sixth.
         size: Any = float(len(pred))
@@ -97,7 +109,6 @@ class DepthModule(LightningModule):
         if stage == "val":
             depth_m = (x.float() * self.max_depth_m for x in (pred, batch["unit_depth"]))
             self.val_metrics.update(*depth_m, batch["valid"])
-        total: Tensor = loss.total
         return total
 
     def on_validation_epoch_end(self) -> None:
@@ -106,8 +117,15 @@ class DepthModule(LightningModule):
         self.val_metrics.reset()
 
     def on_train_epoch_end(self) -> None:
-        """Check the losses that were not looked at yet, before anything is saved."""
+        """Check the losses that were not looked at yet, and what the last step left, before anything is saved."""
         self._check_pending()
+        validated = self.trainer.callback_metrics.get("val/total")
+        if validated is not None and not bool(validated.isfinite()):
+            raise TrainingError(
+                f"the validation loss is {validated.item()} after epoch {self.current_epoch + 1} "
+                f"(step {self.trainer.global_step}): the last steps spoilt the weights. {self._last_good()} "
+                "Lower optim.lr, or train with trainer.precision=32-true."
+            )
 
     def _check_finite(self, batch_idx: int, index: Tensor, total: Tensor) -> None:
         """Look at losses at once on a CPU; on a GPU in lots, since every look waits for the device."""
@@ -123,11 +141,19 @@ class DepthModule(LightningModule):
         batch_idx, index, total = next(entry for entry in pending if not bool(entry[2].isfinite()))
         store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
         names = [store.records[i].id if store else str(i) for i in index.tolist()]
+        step = self.current_epoch * int(self.trainer.num_training_batches) + batch_idx + 1
         raise TrainingError(
-            f"the loss is {total.item()} in epoch {self.current_epoch + 1}, batch {batch_idx}, "
-            f"of the pairs {', '.join(names)}. "
+            f"the loss is {total.item()} in epoch {self.current_epoch + 1}, batch {batch_idx} (step {step}), "
+            f"of the pairs {', '.join(names)}. {self._last_good()} "
             "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
         )
+
+    def _last_good(self) -> str:
+        """Say where the last checkpoint is: it was written before anything became NaN."""
+        paths = [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]
+        if not paths:
+            return "No epoch was finished, so there is no checkpoint."
+        return f"The last good checkpoint is '{paths[-1]}', of epoch {self.current_epoch}."
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, the schedule."""

@@ -6,10 +6,12 @@ import csv
 import io
 import time
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hudepth.files import write_text
+from hudepth.types import Batch
 
 COLUMNS = ("epoch", "height", "width", "images", "wall_s", "cpu_s", "lr")
 
@@ -49,9 +51,11 @@ class Times(Callback):
         self._wall = time.monotonic() - float(last["wall_s"])
         self._cpu = time.process_time() - float(last["cpu_s"])
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, *_: int) -> None:
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
+    ) -> None:
         """Count the images."""
-        self._images += len(batch["index"]) * trainer.world_size  # type: ignore[index]
+        self._images += len(batch["index"]) * trainer.world_size
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the epoch's row."""

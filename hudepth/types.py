@@ -19,6 +19,8 @@ class RawBatch(TypedDict):
     """Position in the depth store."""
     native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]
     """Test batches only: truth at its native resolution [m], 0 where unmeasured."""
+    teacher_m: NotRequired[Float[Tensor, "b h w"]]
+    """Training batches with a teacher only: its depth, 0 where there is none [m, or as the teacher has it]."""
 
 
 class Batch(TypedDict):
@@ -32,6 +34,8 @@ class Batch(TypedDict):
     """True where the truth is measured."""
     index: Int[Tensor, " b"]
     """Position in the depth store."""
+    teacher: NotRequired[Float[Tensor, "b 1 h w"]]
+    """Training batches with a teacher only: its depth / ``max_depth_m``, not clipped; 0 where there is none."""
     small_image: NotRequired[Float[Tensor, "b 3 h2 w2"]]
     """Validation batches only, and only while the network trains at another size: ``image`` at that size."""
     native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]

@@ -1,8 +1,8 @@
 """Augmentation of image and depth together, for whole batches, on whatever device they are.
 
-What moves pixels moves both alike, and what changes the scale of an image changes its depth: in a crop that is enlarged by
-z, everything looks z times as near to the same camera, so depth is divided by z (Eigen et al. 2014, section 3.4). Colours
-change the image alone. CutDepth (Ishii and Yamashita 2021) shows the network a piece of the truth in the image's place.
+What moves pixels moves both alike, and what changes the scale of an image changes its depth: in a crop that is enlarged
+by z, everything looks z times as near to the same camera, so depth is divided by z (Eigen et al. 2014, section 3.4).
+Colours change the image alone. CutDepth (Ishii and Yamashita 2021) shows the network a piece of the truth in its place.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ class Geometry:
 
 def warp(
     image: Float[Tensor, "b 3 h w"],
-    depth: Float[Tensor, "b 1 h w"],
+    depth: Float[Tensor, "b d h w"],
     geometry: Geometry,
     *,
     size: tuple[int, int],
     aspect: float,
-) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
     """Crop, zoom, roll and flip images and depths, and resize them.
 
     Images are interpolated linearly; depth takes the nearest pixel, since the mean of two surfaces is the depth of
@@ -55,7 +55,7 @@ def warp(
 
     Args:
         image: in any unit.
-        depth: in any unit, 0 where unmeasured.
+        depth: one or more maps in any unit, 0 where unmeasured.
         geometry: what to do with each image.
         size: (height, width) of the result.
         aspect: width over height of the scene that the image shows: a roll is one in the scene, also where images are
@@ -79,9 +79,9 @@ def warp(
 
 
 def resize(
-    image: Float[Tensor, "b 3 h w"], depth: Float[Tensor, "b 1 h w"], *, size: tuple[int, int]
-) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
-    """Resize images by the mean of areas, and depths to the nearest pixel; those of this size are returned as they are."""
+    image: Float[Tensor, "b 3 h w"], depth: Float[Tensor, "b d h w"], *, size: tuple[int, int]
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
+    """Resize images by the mean of areas, depths to the nearest pixel; return what has this size as it is."""
     if image.shape[-2:] == size:
         return image, depth
     return functional.interpolate(image, size, mode="area"), functional.interpolate(depth, size, mode="nearest-exact")
@@ -220,24 +220,26 @@ class Augmentation:
         self.tint, self.grey, self.noise, self.blur = tint, grey, noise, blur
         self.cut_depth, self.cut_depth_size = cut_depth, cut_depth_size
         self._moves = flip > 0 or self.zoom != (1.0, 1.0) or rotate_deg > 0 or border > 0
-        self._colours = tint > 0 or grey > 0 or any(
-            span != (1.0, 1.0) for span in (self.gamma, self.brightness, self.contrast, self.saturation)
+        self._colours = (
+            tint > 0
+            or grey > 0
+            or any(span != (1.0, 1.0) for span in (self.gamma, self.brightness, self.contrast, self.saturation))
         )
 
     def __call__(
         self,
         image: Float[Tensor, "b 3 h w"],
-        unit_depth: Float[Tensor, "b 1 h w"],
+        unit_depth: Float[Tensor, "b d h w"],
         *,
         size: tuple[int, int],
         aspect: float,
         generator: torch.Generator,
-    ) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
+    ) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
         """Change a batch.
 
         Args:
             image: RGB in [0, 1].
-            unit_depth: depth / max_depth_m, not clipped, 0 where unmeasured.
+            unit_depth: depth / max_depth_m, not clipped, 0 where unmeasured: the truth, then what is moved with it.
             size: (height, width) of the result.
             aspect: width over height of what the images show.
             generator: of the CPU, whatever device the batch is on: the same draws everywhere.
@@ -266,7 +268,7 @@ class Augmentation:
             sigma = draw.uniform(0, self.noise)[:, None, None, None]
             image = (image + sigma * draw.normal_like(image)).clamp(0, 1)
         if self.cut_depth:
-            image = cut_depth(image, unit_depth.clamp(max=1), self._draw_box(draw))
+            image = cut_depth(image, unit_depth[:, :1].clamp(max=1), self._draw_box(draw))
         return image, unit_depth
 
     def _draw_geometry(self, draw: _Draw) -> Geometry:

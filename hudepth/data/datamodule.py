@@ -23,6 +23,7 @@ from hudepth.data.resolution import read_stages, size_at
 from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split, check_split, make_split
 from hudepth.data.store import DepthStore
+from hudepth.data.teacher import TeacherDepths
 from hudepth.errors import ConfigError
 from hudepth.normalise import normalise_image
 from hudepth.types import Batch, RawBatch
@@ -39,9 +40,11 @@ class DepthDataModule(LightningDataModule):
         fractions: of train, val and test (the paper: 70 / 10 / 20 %).
         max_depth_m: depth is clipped to it and divided by it (the paper: 10 m).
         batch_size: pairs per step (the paper: 8).
-        progressive: sizes to begin with, each until a share of the epochs is over, as ``[{size: [112, 112], until: 0.4}]``;
-            then comes ``size``.
+        progressive: sizes to begin with, each until a share of the epochs is over, then comes ``size``:
+            ``[{size: [112, 112], until: 0.4}]``.
         augment: changes training pairs at random; None leaves them as they are.
+        teacher: folder of depths that another model predicted for the training images (see
+            :class:`hudepth.data.teacher.TeacherDepths`); None: no teacher.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
         seed: of the order of training pairs and of augmentation, which depend on nothing but this and the epoch.
         cache: folder of the depth stores.
@@ -65,6 +68,7 @@ class DepthDataModule(LightningDataModule):
         batch_size: int = 8,
         progressive: Sequence[Mapping[str, Any]] | None = None,
         augment: Augmentation | None = None,
+        teacher: str | Path | None = None,
         num_workers: int = 0,
         seed: int = 42,
         cache: str | Path = "~/.cache/hudepth",
@@ -89,6 +93,8 @@ class DepthDataModule(LightningDataModule):
         self.size = (int(size[0]), int(size[1]))
         self.stages = read_stages(progressive or [], size=self.size)
         self.augment = augment
+        self.teacher_folder = teacher
+        self._teacher: TeacherDepths | None = None
         self._draws: tuple[int, torch.Generator] | None = None
         self.split_kind, self.split_seed, self.fractions = split, split_seed, tuple(fractions)
         self.max_depth_m = float(max_depth_m)
@@ -125,14 +131,21 @@ class DepthDataModule(LightningDataModule):
     def split(self, split: Split) -> None:
         self._split = split
 
+    @property
+    def teacher(self) -> TeacherDepths | None:
+        """The teacher's depths of the training pairs, prepared if need be; None without a teacher."""
+        if self._teacher is None and self.teacher_folder is not None:
+            self._teacher = TeacherDepths(self.teacher_folder, self.store, self.split.train)
+        return self._teacher
+
     def prepare_data(self) -> None:
-        """Build the depth store, once."""
-        _ = self.store
+        """Build the depth store and read the teacher's depths, once."""
+        _ = self.store, self.teacher
 
     def train_dataloader(self) -> DataLoader[RawBatch]:
         """Shuffled training batches; the last, shorter one is kept."""
         rank, world_size = self._shard()
-        dataset = StoreDataset(self.store, self.split.train)
+        dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
         # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees what it would have seen.
         sampler: DistributedSampler[int] = DistributedSampler(
             dataset, num_replicas=world_size, rank=rank, shuffle=True, seed=self.seed
@@ -169,9 +182,9 @@ class DepthDataModule(LightningDataModule):
                 batch,
                 max_depth_m=self.max_depth_m,
                 size=self.train_size,
-                augment=None if self.augment is None else partial(
-                    self.augment, aspect=self._aspect, generator=self._generator()
-                ),
+                augment=None
+                if self.augment is None
+                else partial(self.augment, aspect=self._aspect, generator=self._generator()),
             )
         result = preprocess(batch, max_depth_m=self.max_depth_m)
         if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING and self.train_size != self.size:
@@ -185,7 +198,7 @@ class DepthDataModule(LightningDataModule):
         return float(width / height)
 
     def _generator(self) -> torch.Generator:
-        """Return the source of augmentation's draws: it begins anew each epoch, so that a resumed run draws the same."""
+        """Return what augmentation draws from: it begins anew each epoch, so that a resumed run draws the same."""
         assert self.trainer is not None
         epoch, rank = self.trainer.current_epoch, self.trainer.global_rank
         if self._draws is None or self._draws[0] != epoch:
@@ -229,14 +242,19 @@ def preprocess(
     """
     image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format) / 255
     unit_depth = batch["depth_mm"].to(torch.float32)[:, None] / (1000 * max_depth_m)
+    if "teacher_m" in batch:
+        unit_depth = torch.cat([unit_depth, batch["teacher_m"][:, None] / max_depth_m], dim=1)  # moved as the truth is
     size = size or (image.shape[-2], image.shape[-1])
-    image, unit_depth = (augment or resize)(image, unit_depth, size=size)
+    image, depths = (augment or resize)(image, unit_depth, size=size)
+    unit_depth = depths[:, :1]
     result = Batch(
         image=normalise_image(image),
         unit_depth=unit_depth.clamp(max=1),
         valid=unit_depth > 0,
         index=batch["index"],
     )
+    if "teacher_m" in batch:
+        result["teacher"] = depths[:, 1:]
     if "native_depth" in batch:
         result["native_depth"] = batch["native_depth"]
     return result

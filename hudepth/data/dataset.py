@@ -9,6 +9,7 @@ import torch
 from torch.utils.data import Dataset, Sampler
 
 from hudepth.data.store import DepthStore
+from hudepth.data.teacher import TeacherDepths
 from hudepth.types import RawBatch
 
 
@@ -21,12 +22,21 @@ class StoreDataset(Dataset[RawBatch]):
         store: where the pairs lie.
         indices: which of them, as positions in the store.
         native: also read the truth at its native resolution.
+        teacher: also read a teacher's depths.
     """
 
-    def __init__(self, store: DepthStore, indices: Sequence[int], *, native: bool = False) -> None:
+    def __init__(
+        self,
+        store: DepthStore,
+        indices: Sequence[int],
+        *,
+        native: bool = False,
+        teacher: TeacherDepths | None = None,
+    ) -> None:
         self.store = store
         self.indices = list(indices)
         self.native = native
+        self.teacher = teacher
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -42,6 +52,8 @@ class StoreDataset(Dataset[RawBatch]):
         batch = RawBatch(image=torch.from_numpy(image), depth_mm=torch.from_numpy(depth_mm), index=torch.tensor(rows))
         if self.native:
             batch["native_depth"] = [torch.from_numpy(self.store.read_native(row))[None] for row in rows]
+        if self.teacher is not None:
+            batch["teacher_m"] = torch.from_numpy(self.teacher.read(rows))
         return batch
 
 

@@ -54,9 +54,7 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
     return stages
 
 
-def size_at(
-    stages: Sequence[Stage], epoch: int, *, epochs: int | None, final: tuple[int, int]
-) -> tuple[int, int]:
+def size_at(stages: Sequence[Stage], epoch: int, *, epochs: int | None, final: tuple[int, int]) -> tuple[int, int]:
     """Return the (height, width) of training images in an epoch.
 
     Args:

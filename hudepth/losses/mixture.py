@@ -28,7 +28,7 @@ class Mixture(nn.Module):
         super().__init__()
         for name in weights:
             if name not in losses:
-                raise ConfigError(f"loss.weights.{name}: there is no loss of this name; loss.losses has {list(losses)}.")
+                raise ConfigError(f"loss.weights.{name}: no loss has this name; there are {', '.join(losses)}.")
         for name in losses:
             if name not in weights:
                 raise ConfigError(f"loss.weights: none for '{name}'. Pass loss.weights.{name}=1, or 0 to leave it out.")

@@ -100,7 +100,7 @@ class ResNet18Trunk(nn.Module):
         if weights not in (None, "none"):
             load_trunk_weights(self, weights)
 
-    def train(self, mode: bool = True) -> ResNet18Trunk:  # noqa: FBT001, FBT002 - nn.Module's signature
+    def train(self, mode: bool = True) -> ResNet18Trunk:
         """Switch to training mode, but for batch norm if that is frozen."""
         super().train(mode)
         if self.norm_frozen:

@@ -166,7 +166,9 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     log.info("run directory: %s", path)
     seed_everything(config["seed"], verbose=False)
     trust = list(config["trust"])
-    datamodule = build_data(config["data"], trust=trust, augment=config.get("augment"))
+    distill = config.get("distill") or {}
+    options = {**config["data"], **({"teacher": distill["teacher"]} if is_given(distill) else {})}
+    datamodule = build_data(options, trust=trust, augment=config.get("augment"))
     if datamodule.source.name == "rooms":
         log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
     if config["test"]:  # a wrong protocol should not be found after hours
@@ -236,6 +238,7 @@ def build_module(
     Raises:
         HudepthError: if a part cannot be built.
     """
+    distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
 
     def schedule(optimizer: Optimizer, total_steps: int) -> LRScheduler:
         knows_length = str(config["schedule"]["_target_"]).startswith(f"{StepSchedule.__module__}.")
@@ -248,6 +251,7 @@ def build_module(
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
         optimizer=partial(instantiate, config["optim"], trust=trust, only=Optimizer),
+        distill=instantiate(distill, trust=trust, only=nn.Module) if is_given(distill) else None,
         scheduler=schedule if is_given(config["schedule"]) else None,
         record={
             "config": config,

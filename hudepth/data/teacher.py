@@ -1,0 +1,126 @@
+"""Depths that another model predicted for training images, read beside the truth: what distillation learns from."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from filelock import FileLock
+from numpy.typing import NDArray
+
+from hudepth.console import track
+from hudepth.data.sources.base import Record
+from hudepth.data.sources.files import PerProcess
+from hudepth.data.store import DepthStore
+from hudepth.errors import DataError
+from hudepth.files import written_whole
+
+ENDINGS = (".npy", ".png", "_depth.npy", "_depth.png")
+"""What follows a pair's id in the name of its teacher's depth; the last two are what ``hudepth-predict`` writes."""
+
+
+class TeacherDepths:
+    """A teacher's depths at the training size, prepared once from a folder of files.
+
+    A ``.npy`` holds floats: metres, or whatever an affine-invariant loss makes of them; a ``.png`` 16-bit millimetres.
+    What is not finite or not positive is taken for not predicted.
+
+    Args:
+        folder: with a file for each training pair: its id, then one of :data:`ENDINGS`.
+        store: of the pairs.
+        indices: the training pairs, as positions in the store.
+
+    Raises:
+        DataError: if depths are missing, cannot be read, or are not of their images' size.
+    """
+
+    def __init__(self, folder: str | Path, store: DepthStore, indices: Sequence[int]) -> None:
+        root = Path(folder).expanduser()
+        if not root.is_dir():
+            raise DataError(f"distill.teacher: no folder '{root}'. Pass distill.teacher=<folder of npy or png files>.")
+        rows = sorted(indices)
+        records = [store.records[index] for index in rows]
+        files = _find(root, records)
+        self._position = {index: position for position, index in enumerate(rows)}
+        self.size = store.size
+        key = [store.path.name, [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files], rows]
+        name = f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
+        self.path = store.path.with_name(name)
+        if not self.path.exists():  # first without the lock, which a cache that can only be read has no place for
+            with FileLock(self.path.with_suffix(".lock")):
+                if not self.path.exists():
+                    _prepare(files, records, store, self.path)
+        self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)
+
+    def read(self, indices: Sequence[int]) -> NDArray[np.float32]:
+        """Read depths [n, h, w], 0 where there is none.
+
+        Args:
+            indices: positions in the depth store.
+        """
+        depths = np.empty((len(indices), *self.size), np.float32)
+        source = self._handle.get(self.path)["depth"]
+        for row, index in enumerate(indices):
+            source.read_direct(depths, np.s_[self._position[index]], np.s_[row])
+        return depths
+
+
+def _find(root: Path, records: Sequence[Record]) -> list[Path]:
+    """Return the file of each record."""
+    files, missing = [], []
+    for record in records:
+        found = next((path for ending in ENDINGS if (path := root / f"{record.id}{ending}").is_file()), None)
+        if found is None:
+            missing.append(record.id)
+        else:
+            files.append(found)
+    if missing:
+        raise DataError(
+            f"distill.teacher: {len(missing)} of {len(records)} training pairs have no depth in '{root}', the first is "
+            f"'{missing[0]}': no {missing[0]}.npy or .png. Predict them with hudepth-predict, or lay them there."
+        )
+    return files
+
+
+def _prepare(files: Sequence[Path], records: Sequence[Record], store: DepthStore, path: Path) -> None:
+    native = {tuple(size) for size in store.info.get("native_sizes") or []} | {tuple(store.size)}
+    height, width = store.size
+    try:
+        with written_whole(path) as part, h5py.File(part, "w", libver="latest") as out:
+            depths = out.create_dataset("depth", (len(files), height, width), "f4", chunks=(1, height, width))
+            for row, file in enumerate(track(files, total=len(files), what="reading the teacher's depths")):
+                depth = _read(file)
+                if depth.shape not in native:
+                    sizes = " or ".join(f"{h} x {w}" for h, w in sorted(native, reverse=True)[:3])
+                    raise DataError(
+                        f"distill.teacher: '{file}' is {depth.shape[0]} x {depth.shape[1]}, but the images are {sizes} "
+                        "(height x width). Resize it to its image."
+                    )
+                depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+                depths[row] = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    except OSError as error:
+        raise DataError(
+            f"paths.cache: cannot write '{path}' ({error.strerror or error}). "
+            "Free some space, or pass paths.cache=<a folder you can write to>."
+        ) from error
+
+
+def _read(file: Path) -> NDArray[np.float32]:
+    depth: NDArray[Any] | None = None
+    with suppress(ValueError, OSError, EOFError):  # what is damaged stays None
+        if file.suffix == ".npy":
+            depth = np.load(file, mmap_mode="r", allow_pickle=False)  # mapped: a header may claim anything
+        else:
+            loaded = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            depth = loaded / np.float32(1000) if loaded is not None and loaded.dtype == np.uint16 else None
+    if depth is None or depth.ndim != 2 or depth.dtype.kind not in "fiu":
+        raise DataError(
+            f"distill.teacher: '{file}' is no depth map: a .npy of numbers [height, width], or a 16-bit grey .png [mm]."
+        )
+    return depth.astype(np.float32)

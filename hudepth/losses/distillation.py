@@ -1,0 +1,73 @@
+"""Learning from a teacher's depths: as metres, or up to a scale and a shift (MiDaS, Ranftl et al. 2022)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hudepth.errors import ConfigError, did_you_mean
+from hudepth.losses.baselines import MIN_UNIT_DEPTH, log_difference
+from hudepth.masked import full_precision, masked_mean, masked_sum
+
+KINDS = ("metric", "affine_depth", "affine_inverse")
+"""What a teacher's numbers are: metres; depth, or inverse depth (disparity), up to scale and shift."""
+
+
+def normalised_by_mean(
+    x: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"], *, eps: float = 1e-6
+) -> Float[Tensor, "b 1 h w"]:
+    """Return (x - mean) / mean absolute deviation over the valid pixels of each image; 0 where not valid.
+
+    (Equation 5 of Ranftl et al. 2022, with the mean in the median's place, which is as blind to scale and shift.)
+    """
+    count = masked_sum(torch.ones_like(x), valid, dim=(1, 2, 3)).clamp_min(1)
+    centred = torch.where(valid, x - masked_sum(x, valid, dim=(1, 2, 3)) / count, 0.0)
+    return centred / (centred.abs().sum(dim=(1, 2, 3), keepdim=True) / count + eps)
+
+
+def affine_invariant_loss(
+    pred: Float[Tensor, "b 1 h w"], teacher: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference after each image of both was brought to mean 0 and mean absolute deviation 1."""
+    return masked_mean((normalised_by_mean(pred, valid) - normalised_by_mean(teacher, valid)).abs(), valid)
+
+
+class Distillation(nn.Module):
+    """The distance from a teacher's depths, times a weight; it is added to the loss of the truth.
+
+    Args:
+        kind: one of :data:`KINDS`. ``metric`` compares logarithms of depth.
+        weight: positive.
+
+    Raises:
+        ConfigError: for an unknown kind or another weight.
+    """
+
+    def __init__(self, *, kind: str = "metric", weight: float = 1.0) -> None:
+        super().__init__()
+        if kind not in KINDS:
+            raise ConfigError(f"distill.kind: no '{kind}'.{did_you_mean(kind, KINDS)} Pass one of {', '.join(KINDS)}.")
+        if not (math.isfinite(weight) and weight > 0):
+            raise ConfigError(
+                f"distill.weight: {weight} is not positive. Pass distill=none to learn without a teacher."
+            )
+        self.kind, self.weight = kind, weight
+
+    def forward(self, pred: Float[Tensor, "b 1 h w"], teacher: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+        """Return the distance, before its weight.
+
+        Args:
+            pred: unit depth.
+            teacher: unit depth if the kind is ``metric``, else what the teacher said; 0 where it said nothing.
+        """
+        valid = teacher > 0
+        with torch.autocast(pred.device.type, enabled=False):
+            pred = full_precision(pred)
+            if self.kind == "metric":
+                return masked_mean(log_difference(pred, teacher, valid).abs(), valid)
+            if self.kind == "affine_inverse":
+                pred = 1 / pred.clamp_min(MIN_UNIT_DEPTH)
+            return affine_invariant_loss(pred, teacher, valid)
