@@ -49,7 +49,7 @@ class EMA(WeightAveraging):
         return dict(self._average_model.module.state_dict())
 
 
-def averaged_state(trainer: Trainer, checkpoint: dict[str, Any]) -> dict[str, Tensor] | None:
+def averaged_state(trainer: Trainer | None, checkpoint: dict[str, Any]) -> dict[str, Tensor] | None:
     """Return the averaged weights that belong into a checkpoint that lacks them, or None.
 
     Lightning hands checkpoints to the averaging callback unless they hold weights only, which ``best.ckpt`` does.

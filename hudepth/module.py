@@ -119,12 +119,11 @@ class DepthModule(LightningModule):
     def on_train_epoch_end(self) -> None:
         """Check the losses that were not looked at yet, and what the last step left, before anything is saved."""
         self._check_pending()
-        validated = self.trainer.callback_metrics.get("val/total")
-        if validated is not None and not bool(validated.isfinite()):
+        finite = torch.stack([parameter.detach().isfinite().all() for parameter in self.net.parameters()]).all()
+        if not bool(finite):
             raise TrainingError(
-                f"the validation loss is {validated.item()} after epoch {self.current_epoch + 1} "
-                f"(step {self.trainer.global_step}): the last steps spoilt the weights. {self._last_good()} "
-                "Lower optim.lr, or train with trainer.precision=32-true."
+                f"weights are no longer finite after epoch {self.current_epoch + 1} (step {self.trainer.global_step}). "
+                f"{self._last_good()} Lower optim.lr, or train with trainer.precision=32-true."
             )
 
     def _check_finite(self, batch_idx: int, index: Tensor, total: Tensor) -> None:
@@ -149,7 +148,7 @@ class DepthModule(LightningModule):
         )
 
     def _last_good(self) -> str:
-        """Say where the last checkpoint is: it was written before anything became NaN."""
+        """Tell where the last checkpoint is: it was written before anything became NaN."""
         paths = [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]
         if not paths:
             return "No epoch was finished, so there is no checkpoint."
@@ -169,7 +168,7 @@ class DepthModule(LightningModule):
 
         If weights are averaged, a checkpoint holds the average.
         """
-        averaged = averaged_state(self.trainer, checkpoint)
+        averaged = averaged_state(self._trainer, checkpoint)
         if averaged is not None:
             checkpoint["state_dict"] = averaged
         checkpoint[ckpt.KEY] = {"version": ckpt.VERSION, **self._record}

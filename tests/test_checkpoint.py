@@ -48,7 +48,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         BADCL(),
         max_depth_m=10.0,
         optimizer=partial(torch.optim.AdamW, lr=1e-2),
-        scheduler=partial(torch.optim.lr_scheduler.OneCycleLR, max_lr=1e-2, total_steps=5),
+        scheduler=lambda optimizer, total: torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, max_lr=1e-2, total_steps=total + 1
+        ),
         record={"config": config, "split": data.split.summary(), "data": {"source": "rooms", "pairs": 12}},
     )
     Trainer(

@@ -143,7 +143,9 @@ def test_raw_terms_are_logged_apart_from_their_weights(cache: Path) -> None:
 
 def test_schedule_steps_once_an_epoch(cache: Path) -> None:
     spy = Spy()
-    module = make_module(lr=0.8, scheduler=partial(torch.optim.lr_scheduler.StepLR, step_size=1, gamma=0.5))
+    module = make_module(
+        lr=0.8, scheduler=lambda optimizer, _: torch.optim.lr_scheduler.StepLR(optimizer, step_size=1, gamma=0.5)
+    )
     make_trainer(spy, max_epochs=4).fit(module, datamodule=make_data(cache))
     assert spy.rates == pytest.approx([0.8, 0.4, 0.2, 0.1])
 
@@ -189,7 +191,8 @@ def test_a_loss_that_is_not_finite_stops_before_the_step(cache: Path, value: flo
     index, before = batches[-1]
     pairs = ", ".join(data.store.records[i].id for i in index)
     assert str(caught.value) == (
-        f"the loss is {value} in epoch 1, batch 1, of the pairs {pairs}. "
+        f"the loss is {value} in epoch 1, batch 1 (step 2), of the pairs {pairs}. "
+        "No epoch was finished, so there is no checkpoint. "
         "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
     )
     for name, parameter in module.net.named_parameters():
@@ -199,7 +202,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step(cache: Path, value: flo
 def test_a_poisoned_weight_is_found_at_the_first_batch(cache: Path) -> None:
     module = make_module()
     nn.init.constant_(module.net.decode.bias, float("nan"))  # type: ignore[arg-type]
-    with pytest.raises(TrainingError, match="the loss is nan in epoch 1, batch 0, of the pairs room_"):
+    with pytest.raises(TrainingError, match=r"the loss is nan in epoch 1, batch 0 \(step 1\), of the pairs room_"):
         make_trainer().fit(module, datamodule=make_data(cache))
 
 
@@ -215,9 +218,27 @@ def test_losses_not_yet_looked_at_are_checked_before_an_epoch_is_saved(
     keeper = ModelCheckpoint(tmp_path, "last", save_on_train_epoch_end=True, enable_version_counter=False)
     trainer = make_trainer(keeper, max_epochs=3)
     module = make_module(PoisonedLoss(good_calls=6, value=float("nan")))  # epoch 1: 3 training and 1 validation batch
-    with pytest.raises(TrainingError, match="the loss is nan in epoch 2, batch 2, of the pairs room_"):
+    with pytest.raises(
+        TrainingError, match=r"the loss is nan in epoch 2, batch 2 \(step 6\), of the pairs room_"
+    ) as caught:
         trainer.fit(module, datamodule=make_data(cache))
+    assert f"The last good checkpoint is '{tmp_path / 'last.ckpt'}', of epoch 1." in str(caught.value)
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 0
+
+
+def test_weights_spoilt_by_the_last_step_of_an_epoch_are_found_before_it_is_saved(cache: Path, tmp_path: Path) -> None:
+    class Spoil(Callback):
+        def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+            if trainer.current_epoch == 1 and trainer.is_last_batch:
+                nn.init.constant_(pl_module.net.decode.bias, float("nan"))  # type: ignore[arg-type]
+
+    keeper = ModelCheckpoint(tmp_path, "last", save_on_train_epoch_end=True, enable_version_counter=False)
+    with pytest.raises(TrainingError) as caught:
+        make_trainer(keeper, Spoil(), max_epochs=3).fit(make_module(), datamodule=make_data(cache))
+    assert str(caught.value) == (
+        f"weights are no longer finite after epoch 2 (step 6). The last good checkpoint is '{tmp_path / 'last.ckpt'}', "
+        "of epoch 1. Lower optim.lr, or train with trainer.precision=32-true."
+    )
 
 
 def test_a_bad_validation_loss_does_not_stop_training(cache: Path) -> None:
@@ -237,15 +258,16 @@ def test_bf16_mixed(cache: Path) -> None:
 
 
 def test_optimizer_gets_the_networks_parameters() -> None:
-    seen: list[list[nn.Parameter]] = []
+    seen: list[list[tuple[str, nn.Parameter]]] = []
 
-    def optimizer(parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
-        seen.append(list(parameters))
-        return torch.optim.AdamW(seen[-1])
+    def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
+        named = list(parameters)
+        seen.append(named)
+        return torch.optim.AdamW(named)
 
     module = make_module(optimizer=optimizer)
     assert isinstance(module.configure_optimizers(), torch.optim.AdamW)
-    assert [id(p) for p in seen[0]] == [id(p) for p in module.net.parameters()]
+    assert [(n, id(p)) for n, p in seen[0]] == [(n, id(p)) for n, p in module.net.named_parameters()]
 
 
 def test_checkpoints_carry_the_record() -> None:

@@ -97,19 +97,16 @@ def split_kernel(
 
 def is_usual_head(up: nn.ConvTranspose2d, head: nn.Conv2d) -> bool:
     """Whether these are layers that :func:`joint_head` can join."""
-    return (
-        (up.kernel_size, up.stride, up.padding) == ((4, 4), (2, 2), (1, 1))
-        and (head.kernel_size, head.stride, head.padding, head.out_channels) == ((3, 3), (1, 1), (1, 1), 1)
-        and up.bias is not None
-        and head.bias is not None
+    return (up.kernel_size, up.stride, up.padding) == ((4, 4), (2, 2), (1, 1)) and (
+        (head.kernel_size, head.stride, head.padding, head.out_channels) == ((3, 3), (1, 1), (1, 1), 1)
     )
 
 
 def joint_head(
     up_weight: Float[Tensor, "c_in c_mid 4 4"],
-    up_bias: Float[Tensor, " c_mid"],
+    up_bias: Float[Tensor, " c_mid"] | None,
     head_weight: Float[Tensor, "1 c_mid 3 3"],
-    head_bias: Float[Tensor, " 1"],
+    head_bias: Float[Tensor, " 1"] | None,
 ) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
     """Join a transposed convolution (stride 2, padding 1) and the 3 x 3 convolution to one channel that follows it.
 
@@ -127,7 +124,10 @@ def joint_head(
             tap = torch.einsum("iokl,o->ikl", up_weight, head_weight[0, :, row, column])
             joint = joint + functional.pad(tap, (2 - column, column, 2 - row, row))
     phases = joint.reshape(-1, 3, 2, 3, 2).flip(1, 3).permute(2, 4, 0, 1, 3).flatten(0, 1)
-    return phases, (head_weight[0].sum((1, 2)) @ up_bias + head_bias).expand(4)
+    bias = up_weight.new_zeros(1) if head_bias is None else head_bias
+    if up_bias is not None:
+        bias = bias + head_weight[0].sum((1, 2)) @ up_bias
+    return phases, bias.expand(4)
 
 
 def run_head(

@@ -100,8 +100,6 @@ class HybridUNet(nn.Module):
         if not self.merged:
             result: Tensor = self.head(self.head_up(x))
             return result
-        assert self.head_up.bias is not None
-        assert self.head.bias is not None
         with torch.autocast(x.device.type, enabled=False):  # sums of many small products: in full precision
             joint = joint_head(self.head_up.weight, self.head_up.bias, self.head.weight, self.head.bias)
         return run_head(self.head_up, self.head, x, joint=joint)

@@ -70,6 +70,7 @@ def _merge_linear_steps(net: nn.Module) -> None:
         up, head = getattr(module, "head_up", None), getattr(module, "head", None)
         if isinstance(up, nn.ConvTranspose2d) and isinstance(head, nn.Conv2d) and is_usual_head(up, head):
             module.head_up, module.head = nn.Identity(), MergedHead(up, head)
+            module.merged = False  # type: ignore[assignment]  # it is now, for good
 
 
 class MergedUpBlock(nn.Module):
@@ -115,8 +116,8 @@ class MergedHead(nn.Module):
     def __init__(self, up: nn.ConvTranspose2d, head: nn.Conv2d) -> None:
         super().__init__()
         self.up, self.head = up, head
-        double = (t.detach().double() for t in (up.weight, up.bias, head.weight, head.bias) if t is not None)
-        weight, bias = joint_head(*double)
+        up_bias, head_bias = (None if b is None else b.detach().double() for b in (up.bias, head.bias))
+        weight, bias = joint_head(up.weight.detach().double(), up_bias, head.weight.detach().double(), head_bias)
         self.joint = nn.Conv2d(up.in_channels, 4, 3, padding=1)
         assert self.joint.bias is not None
         with torch.no_grad():

@@ -36,7 +36,8 @@ def composed(*overrides: str, task: str = "train") -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    "group", ["data", "model", "loss", "optim", "schedule", "trainer", "callbacks", "logger", "protocol"]
+    "group",
+    ["data", "model", "augment", "loss", "distill", "optim", "schedule", "trainer", "callbacks", "logger", "protocol"],
 )
 def test_every_choice_of_every_group_composes(group: str) -> None:
     for name in set(names(group)) - {"base"}:
@@ -53,7 +54,7 @@ def test_every_experiment_changes_something_and_runs_a_step(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HUDEPTH_CACHE", str(tmp_path_factory.getbasetemp() / "conf_cache"))
     steps = ["trainer.limit_train_batches=1", "trainer.limit_val_batches=1"]
-    weights = ["model.weights=none"] if choice == "experiment=badcl" else []
+    weights = ["model.weights=none"] if choice.startswith("experiment=") else []
     sys_argv = ["hudepth-train", choice, *SMALL, *steps, *weights]
     monkeypatch.setattr(sys, "argv", sys_argv)
     assert cli.train() == 0

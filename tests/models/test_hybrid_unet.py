@@ -218,7 +218,8 @@ def test_size_that_does_not_fit_names_the_nearest(net: HybridUNet, height: int, 
         ),
         (
             {"output": "sigmoidal"},
-            "model.output: no 'sigmoidal'. Did you mean 'sigmoid'? Pass one of sigmoid, relu, softplus, identity.",
+            "model.output: no 'sigmoidal'. Did you mean 'sigmoid'? "
+            "Pass one of sigmoid, relu, softplus, identity, log, bins.",
         ),
     ],
 )

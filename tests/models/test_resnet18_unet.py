@@ -206,7 +206,8 @@ def test_any_other_size_is_told_the_nearest(height: int, width: int) -> None:
         ),
         (
             {"output": "sigmoyd"},
-            "model.output: no 'sigmoyd'. Did you mean 'sigmoid'? Pass one of sigmoid, relu, softplus, identity.",
+            "model.output: no 'sigmoyd'. Did you mean 'sigmoid'? "
+            "Pass one of sigmoid, relu, softplus, identity, log, bins.",
         ),
     ],
 )
