@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -23,6 +23,19 @@ from hudepth.metrics.collection import DepthMetrics, DepthSSIM
 from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.schedules import StepSchedule
 from hudepth.types import Batch
+
+LOTS = {"cpu": 1}
+"""After how many steps losses are looked at, by kind of device; else 50, since every look waits for the device."""
+
+
+class _Step(NamedTuple):
+    """A training step whose loss was not looked at yet."""
+
+    batch_idx: int
+    rows: Tensor
+    """Positions of its pairs in the depth store."""
+    total: Tensor
+    emptied: Tensor
 
 
 class DepthModule(LightningModule):
@@ -64,7 +77,7 @@ class DepthModule(LightningModule):
         )
         self._make_optimizer, self._make_scheduler = optimizer, scheduler
         self._record = record or {}
-        self._unchecked: deque[tuple[int, Tensor, Tensor]] = deque()
+        self._unchecked: deque[_Step] = deque()
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Predict unit depth from normalised images."""
@@ -74,7 +87,10 @@ class DepthModule(LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
         total = self._step(batch, "train")
-        self._check_finite(batch_idx, batch["index"], total.detach())
+        emptied = batch["emptied"] if "emptied" in batch else torch.zeros_like(total, dtype=torch.bool)
+        self._unchecked.append(_Step(batch_idx, batch["index"], total.detach(), emptied))
+        if len(self._unchecked) >= LOTS.get(total.device.type, 50):
+            self._check_pending()
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -126,24 +142,25 @@ class DepthModule(LightningModule):
                 f"{self._last_good()} Lower optim.lr, or train with trainer.precision=32-true."
             )
 
-    def _check_finite(self, batch_idx: int, index: Tensor, total: Tensor) -> None:
-        """Look at losses at once on a CPU; on a GPU in lots, since every look waits for the device."""
-        self._unchecked.append((batch_idx, index, total))
-        if len(self._unchecked) >= (1 if total.device.type == "cpu" else 50):
-            self._check_pending()
-
     def _check_pending(self) -> None:
+        """Look at the losses of the steps that were not looked at yet."""
         pending = list(self._unchecked)
         self._unchecked.clear()
-        if not pending or bool(torch.stack([total for *_, total in pending]).isfinite().all()):
+        bad = [~step.total.isfinite() | step.emptied for step in pending]
+        if not bad or not bool(torch.stack(bad).any()):
             return
-        batch_idx, index, total = next(entry for entry in pending if not bool(entry[2].isfinite()))
+        first = next(step for step, is_bad in zip(pending, bad, strict=True) if bool(is_bad))
         store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
-        names = [store.records[i].id if store else str(i) for i in index.tolist()]
-        step = self.current_epoch * int(self.trainer.num_training_batches) + batch_idx + 1
+        names = ", ".join(store.records[i].id if store else str(i) for i in first.rows.tolist())
+        number = self.current_epoch * int(self.trainer.num_training_batches) + first.batch_idx + 1
+        where = f"in epoch {self.current_epoch + 1}, batch {first.batch_idx} (step {number}), of the pairs {names}"
+        if bool(first.emptied):
+            raise TrainingError(
+                f"augmentation left no measured pixel {where}. Lower augment.zoom, augment.rotate_deg or "
+                "augment.border, or raise data.batch_size."
+            )
         raise TrainingError(
-            f"the loss is {total.item()} in epoch {self.current_epoch + 1}, batch {batch_idx} (step {step}), "
-            f"of the pairs {', '.join(names)}. {self._last_good()} "
+            f"the loss is {first.total.item()} {where}. {self._last_good()} "
             "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
         )
 

@@ -6,8 +6,9 @@
       config.yaml        resolved, plain YAML           overrides.txt   what was typed
       environment.json   versions, git state, device    split.json      ids of each subset
       status.json        running | finished | failed | interrupted
-      train.log          metrics.csv                    checkpoints/best.ckpt, last.ckpt
+      train.log          metrics.csv  times.csv         checkpoints/best.ckpt, last.ckpt
       tensorboard/       images/                        test/<protocol>/metrics.json, per_image.csv, panels.png
+      scored.json        each time that test images were looked at
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from hudepth.console import log
 from hudepth.errors import CheckpointError, ConfigError
 from hudepth.files import read_yaml, write_json, write_text
 
+SCORED = "scored.json"
 CHECKPOINTS = "checkpoints"
 BEST, LAST = "best.ckpt", "last.ckpt"
 PACKAGES = ("hudepth", "torch", "lightning", "torchmetrics", "hydra-core", "h5py", "numpy", "opencv-python-headless")
@@ -58,6 +60,43 @@ def create(parent: str | Path, name: str) -> Path:
             ) from error
         return path.resolve()
     raise ConfigError(f"paths.runs: '{base}' holds too many runs of this second.")
+
+
+def note_scored(path: Path, *, epoch: int, data: str, split: str, protocols: Sequence[str]) -> list[int]:
+    """Note that a run's network was scored on test images, and say how often that had happened before.
+
+    A number that was chosen among several by looking at test images is no test any more, so each look is kept.
+
+    Args:
+        path: the run directory.
+        epoch: of the checkpoint.
+        data: name of the set.
+        split: hash of the split.
+        protocols: what it was scored by.
+
+    Returns:
+        The epochs of the other checkpoints of this run that were scored on the same test images before.
+
+    Raises:
+        OSError: if the note cannot be written.
+    """
+    looks = scored(path)
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    write_json(
+        path / SCORED,
+        [*looks, {"time": now, "epoch": epoch, "data": data, "split": split, "protocols": list(protocols)}],
+    )
+    return sorted({look["epoch"] for look in looks if look["split"] == split and look["epoch"] != epoch})
+
+
+def scored(path: Path) -> list[dict[str, Any]]:
+    """Return each time that a run's network was scored on test images; none if nothing readable says so."""
+    try:
+        looks = json.loads((path / SCORED).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    keys = {"time", "epoch", "data", "split", "protocols"}
+    return [look for look in looks if isinstance(look, dict) and keys <= look.keys()] if isinstance(looks, list) else []
 
 
 def write_start(

@@ -36,6 +36,8 @@ class Batch(TypedDict):
     """Position in the depth store."""
     teacher: NotRequired[Float[Tensor, "b 1 h w"]]
     """Training batches with a teacher only: its depth / ``max_depth_m``, not clipped; 0 where there is none."""
+    emptied: NotRequired[Bool[Tensor, ""]]
+    """Augmented batches only: whether there was measured depth before augmentation, and none is left."""
     small_image: NotRequired[Float[Tensor, "b 3 h2 w2"]]
     """Validation batches only, and only while the network trains at another size: ``image`` at that size."""
     native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]

@@ -245,6 +245,7 @@ def preprocess(
     if "teacher_m" in batch:
         unit_depth = torch.cat([unit_depth, batch["teacher_m"][:, None] / max_depth_m], dim=1)  # moved as the truth is
     size = size or (image.shape[-2], image.shape[-1])
+    measured = (unit_depth > 0).any()
     image, depths = (augment or resize)(image, unit_depth, size=size)
     unit_depth = depths[:, :1]
     result = Batch(
@@ -253,6 +254,8 @@ def preprocess(
         valid=unit_depth > 0,
         index=batch["index"],
     )
+    if augment is not None:
+        result["emptied"] = measured & ~result["valid"].any()
     if "teacher_m" in batch:
         result["teacher"] = depths[:, 1:]
     if "native_depth" in batch:

@@ -11,6 +11,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 from torch import nn
 
+from hudepth import run_dir
 from hudepth.baselines import trivial_baselines
 from hudepth.callbacks import evenly_spaced, make_panels
 from hudepth.checkpoint import Checkpoint
@@ -70,6 +71,14 @@ def score_checkpoint(
     if not trainer.is_global_zero:
         return {}
     shared = _stamp(checkpoint, datamodule)
+    # None: a file that was moved away from its run knows nothing of earlier looks at the test images
+    shared["checkpoint"]["scored_before"] = checkpoint.run and run_dir.note_scored(
+        checkpoint.run,
+        epoch=checkpoint.epoch,
+        data=datamodule.source.name,
+        split=datamodule.split.sha256,
+        protocols=[protocol.name for protocol in protocols],
+    )
     results, failed = {}, []
     for protocol in protocols:
         try:

@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 from hudepth.checkpoint import Checkpoint, load_checkpoint
 from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
-from hudepth.data.splits import Split, load_split, make_split
 from hudepth.errors import CheckpointError, ConfigError, DataError, did_you_mean
 from hudepth.tasks.common import build_data
 from hudepth.tasks.config import plain
+from hudepth.tasks.lineage import recorded_split, refuse_training_pairs
 from hudepth.tasks.score import score_checkpoint
 
 
@@ -61,7 +61,7 @@ def open_data(
     datamodule = build_data(_data_config(checkpoint, typed, overrides), trust=trust)
     other_data = "_target_" in typed or any(key.startswith(("split", "fractions")) for key in typed)
     if other_data:
-        _refuse_training_pairs(checkpoint, datamodule)
+        refuse_training_pairs(checkpoint, datamodule, subsets=("test",))
     else:
         _restore_split(checkpoint, datamodule)
     return datamodule, other_data
@@ -95,15 +95,9 @@ def _data_config(checkpoint: Checkpoint, typed: dict[str, Any], overrides: list[
     return data
 
 
-def _recorded_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | None:
-    """Return the split of the training run from its split.json, if the checkpoint still lies beside it."""
-    file = checkpoint.run / "split.json" if checkpoint.run else None
-    return load_split(file, datamodule.store.records) if file and file.is_file() else None
-
-
 def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
     """Use the very split of the training run: from its split.json, else made again and compared by hash."""
-    recorded = _recorded_split(checkpoint, datamodule)
+    recorded = recorded_split(checkpoint, datamodule)
     if recorded:
         datamodule.split = recorded
     if datamodule.store.info["fingerprint"] != checkpoint.data.get("fingerprint"):
@@ -113,20 +107,4 @@ def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
             f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so "
             "test pairs may have been trained on. "
             "Pass the data.root it was trained on, or data=<name> to test on other data."
-        )
-
-
-def _refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
-    """Refuse to test on pairs the network was trained on, where the data is the very set of its training."""
-    if datamodule.store.info["fingerprint"] != checkpoint.data.get("fingerprint"):
-        return
-    split = checkpoint.split
-    trained = _recorded_split(checkpoint, datamodule) or make_split(
-        datamodule.store.records, kind=split["kind"], seed=split["seed"], fractions=split["fractions"]
-    )
-    shared = set(trained.train) & set(datamodule.split.test)
-    if shared:
-        raise DataError(
-            f"data.split={datamodule.split.kind}: {len(shared)} of {len(datamodule.split.test)} test pairs were "
-            f"trained on, under data.split={trained.kind}. Leave data.split out to test on what was held out."
         )

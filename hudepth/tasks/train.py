@@ -34,6 +34,7 @@ from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, chec
 from hudepth.tasks.common import build_data, build_protocols, is_given, without_known_warnings
 from hudepth.tasks.config import plain
 from hudepth.tasks.devices import check_shares
+from hudepth.tasks.lineage import BEFORE, lineage, refuse_training_pairs
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.score import score_checkpoint
 from hudepth.tasks.trainer import build_callbacks, build_run_trainer
@@ -176,14 +177,23 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     net = instantiate(config["model"], trust=trust, only=nn.Module)
     net.to(memory_format=MEMORY_FORMATS[config.get("memory_format", "contiguous")])
     check_input(net, datamodule.sizes)
-    if config.get("init") and resumed is None:
-        start_from(net, config["init"])
     split_file = path / "split.json"
     if resumed is not None and split_file.exists():
         datamodule.split = load_split(split_file, datamodule.store.records)
     elif _first_process():
         save_split(split_file, datamodule.split, datamodule.store.records)
-    module = build_module(config, net, datamodule, trust=trust)
+    before: list[dict[str, Any]] = []
+    if resumed is not None:
+        if epochs := sorted({look["epoch"] for look in run_dir.scored(path)}):
+            log.warning(
+                "the test images of this run were looked at after epoch %s: if that is why it goes on, its next test "
+                "flatters it. metrics.json will say so (scored_before)",
+                ", ".join(map(str, epochs)),
+            )
+        before = load_checkpoint(str(path / run_dir.CHECKPOINTS / run_dir.LAST)).data.get(BEFORE, [])
+    elif config.get("init"):
+        before = start_from(net, str(config["init"]), datamodule)
+    module = build_module(config, net, datamodule, trust=trust, before=before)
     check_monitor(config["monitor"], module)
     callbacks = build_callbacks(config, path, datamodule)
     with without_known_warnings():
@@ -215,25 +225,44 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
     return None if score is None else float(score)
 
 
-def start_from(net: nn.Module, spec: str) -> None:
+def start_from(net: nn.Module, spec: str, datamodule: DepthDataModule) -> list[dict[str, Any]]:
     """Give a network the weights of a checkpoint to begin with.
 
     Args:
         net: to be filled.
         spec: a run, a checkpoint or a bundle, as for ``checkpoint=`` of the other verbs.
+        datamodule: of the training to come.
+
+    Returns:
+        What these weights were trained on: the checkpoints to come say so, too.
 
     Raises:
         CheckpointError: if there is no such checkpoint, or it is of another network.
+        DataError: if it was trained on pairs that are to judge the network now.
     """
     checkpoint = load_checkpoint(spec)
+    refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))
     checkpoint.fill(net)
     log.info("init: weights of '%s', epoch %d", checkpoint.path, checkpoint.epoch)
+    return lineage(checkpoint)
 
 
 def build_module(
-    config: dict[str, Any], net: nn.Module, datamodule: DepthDataModule, *, trust: list[str]
+    config: dict[str, Any],
+    net: nn.Module,
+    datamodule: DepthDataModule,
+    *,
+    trust: list[str],
+    before: list[dict[str, Any]] | None = None,
 ) -> DepthModule:
     """Build loss, optimiser and schedule of a configuration around a network.
+
+    Args:
+        config: of the run.
+        net: to be trained.
+        datamodule: its data.
+        trust: further modules whose classes may be named.
+        before: what the weights it starts from were trained on.
 
     Raises:
         HudepthError: if a part cannot be built.
@@ -257,8 +286,11 @@ def build_module(
             "config": config,
             "split": datamodule.split.summary(),
             "data": {
-                key: datamodule.store.info[key]
-                for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")
+                **{
+                    key: datamodule.store.info[key]
+                    for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")
+                },
+                **({BEFORE: before} if before else {}),
             },
         },
     )

@@ -143,7 +143,7 @@ def test_depth_is_the_crop_with_repeated_pixels_and_all_as_much_nearer(
     moved, found = warp(image, depth, geometry(zoom=float(zoom), centre=centre), size=size, aspect=2.0)
     part = depth[:, :, top : top + height, left : left + width].numpy()
     np.testing.assert_array_equal(found.numpy(), part.repeat(zoom, axis=2).repeat(zoom, axis=3) / np.float32(zoom))
-    if 0 < top and 0 < left and top + height < size[0] and left + width < size[1]:  # cv2 repeats the crop's own edge
+    if top > 0 and left > 0 and top + height < size[0] and left + width < size[1]:  # cv2 repeats the crop's own edge
         around = image[0, :, top - 1 : top + height + 1, left - 1 : left + width + 1].permute(1, 2, 0).numpy()
         large = cv2.resize(around, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_LINEAR)[zoom:-zoom, zoom:-zoom]
         np.testing.assert_allclose(moved[0].permute(1, 2, 0), large, atol=1e-5)
@@ -229,7 +229,7 @@ def test_image_and_depth_move_together(seed: int) -> None:
     x, y = (torch.from_numpy(axis).float() for axis in axes(size))
     image = torch.stack([(x + 1) / 2, (y + 1) / 2, torch.ones(size)])[None].repeat(4, 1, 1, 1)
     depth = image[:, :2] + 1
-    augmentation = Augmentation(flip=0.5, zoom=(1, 2.5), zoom_depth=False, rotate_deg=40, border=0.05)
+    augmentation = Augmentation(flip=0.5, zoom=(1, 2.5), zoom_depth=False, rotate_deg=40)
     moved, moved_depth = run(augmentation, image, depth, seed=seed)
     seen = (moved_depth > 0).all(dim=1)
     assert seen.float().mean() > 0.5
@@ -474,9 +474,9 @@ def coordinates(count: int, size: tuple[int, int] = (32, 32)) -> Tensor:
 
 def corners(picture: Tensor) -> tuple[Tensor, Tensor]:
     """Return where the crop's left and right edge, or top and bottom, lie in a picture of coordinates."""
-    low, high = picture[..., 1], picture[..., -2]  # the outermost pixels repeat what lies at the image's edge
-    step = (high - low) / (picture.shape[-1] - 3)
-    return low - 1.5 * step, high + 1.5 * step
+    low, high = picture[..., 3], picture[..., -4]  # the outermost pixels may repeat what lies at the edge
+    step = (high - low) / (picture.shape[-1] - 7)
+    return low - 3.5 * step, high + 3.5 * step
 
 
 def test_crops_lie_anywhere_within_what_the_border_leaves() -> None:

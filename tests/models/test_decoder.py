@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
+import numpy as np
 import pytest
 import torch
-from torch import nn
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor, nn
 from torch.nn import functional
 
-from hudepth.models.decoder import UpBlock
+from hudepth.models.decoder import UpBlock, is_usual_head, joint_head, run_head, split_kernel
 
 
 def identity_block(channels_in: int, channels_skip: int, *, keep: int, upsample: str) -> UpBlock:
@@ -71,3 +76,147 @@ def test_inputs_stay_as_they_are() -> None:
     UpBlock(2, 2, 2)(x, skip)
     assert torch.equal(x, before[0])
     assert torch.equal(skip, before[1])
+
+
+# --- linear steps that follow each other, as one ------------------------------------------------------------------
+
+
+def assert_same(plain: Callable[[], Tensor], merged: Callable[[], Tensor], leaves: Iterable[Tensor]) -> None:
+    """Compare results and the gradients of all leaves, in float64."""
+    leaves = list(leaves)
+    results = [plain(), merged()]
+    torch.testing.assert_close(results[1], results[0], rtol=1e-10, atol=1e-12)
+    weights = torch.randn_like(results[0])  # so that no two pixels stand for each other
+    gradients = [torch.autograd.grad((result * weights).sum(), leaves) for result in results]
+    for ours, theirs in zip(gradients[1], gradients[0], strict=True):
+        assert theirs.abs().sum() > 0
+        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-11)
+
+
+def leaf(*shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, requires_grad=True)
+
+
+channels = st.integers(1, 4)
+sides = st.integers(1, 5)
+
+
+@given(coarse=channels, fine=channels, out=channels, height=sides, width=sides, seed=st.integers(0, 1000))
+def test_a_split_kernel_does_what_the_whole_does_to_the_doubled_map(
+    coarse: int, fine: int, out: int, height: int, width: int, seed: int
+) -> None:
+    torch.manual_seed(seed)
+    x, skip = leaf(2, coarse, height, width), leaf(2, fine, 2 * height, 2 * width)
+    weight, bias = leaf(out, coarse + fine, 3, 3), leaf(out)
+
+    def plain() -> Tensor:
+        doubled = x.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+        return functional.conv2d(torch.cat([doubled, skip], dim=1), weight, bias, padding=1)
+
+    def merged() -> Tensor:
+        large, small = split_kernel(weight, channels_in=coarse)
+        assert large.shape == (coarse, out, 4, 4)
+        assert small.equal(weight[:, coarse:])
+        result = functional.conv_transpose2d(x, large, bias, stride=2, padding=1)
+        return result + functional.conv2d(skip, small, padding=1)
+
+    assert_same(plain, merged, [x, skip, weight, bias])
+
+
+def test_a_split_kernel_by_hand() -> None:
+    """Along one line, taps a, b, c see pixels 0 0 1 1 of the doubled line: c, b + c, a + b, a of the two."""
+    weight = torch.zeros(1, 2, 3, 3)
+    weight[0, 0, 1] = torch.tensor([1.0, 10.0, 100.0])
+    line = torch.tensor([100.0, 110.0, 11.0, 1.0])
+    expected = np.outer([0, 1, 1, 0], line)  # the middle row of taps sees each doubled row once
+    np.testing.assert_array_equal(split_kernel(weight, channels_in=1)[0][0, 0], expected)
+
+
+@pytest.mark.parametrize("training", [True, False])
+@given(coarse=channels, fine=channels, out=channels, height=sides, width=sides, seed=st.integers(0, 1000))
+def test_an_up_block_of_merged_arithmetic_is_the_same_block(
+    training: bool, coarse: int, fine: int, out: int, height: int, width: int, seed: int
+) -> None:
+    torch.manual_seed(seed)
+    blocks = [UpBlock(coarse, fine, out, arithmetic=how).double().train(training) for how in ("plain", "merged")]  # type: ignore[arg-type]
+    assert [block.merged for block in blocks] == [False, True]
+    for bn in (blocks[0].bn1, blocks[0].bn2):
+        nn.init.normal_(bn.weight)
+        nn.init.normal_(bn.bias, mean=1.0)  # so that ReLU lets most of it through
+    blocks[1].load_state_dict(blocks[0].state_dict())
+    x, skip = leaf(2, coarse, height, width), leaf(2, fine, 2 * height, 2 * width)
+    results = [block(x, skip) for block in blocks]
+    torch.testing.assert_close(results[1], results[0], rtol=1e-8, atol=1e-10)
+    weights = torch.randn_like(results[0])
+    gradients = []
+    for block, result in zip(blocks, results, strict=True):
+        gradients.append(torch.autograd.grad((result * weights).sum(), [x, skip, *block.parameters()]))
+    for ours, theirs in zip(gradients[1], gradients[0], strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-8)
+    for ours, theirs in zip(blocks[1].buffers(), blocks[0].buffers(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+def test_bilinear_up_blocks_stay_plain() -> None:
+    torch.manual_seed(0)
+    merged, plain = (UpBlock(2, 2, 2, upsample="bilinear", arithmetic=how) for how in ("merged", "plain"))  # type: ignore[arg-type]
+    assert not merged.merged
+    plain.load_state_dict(merged.state_dict())
+    x, skip = torch.randn(1, 2, 3, 3), torch.randn(1, 2, 6, 6)
+    assert merged(x, skip).equal(plain(x, skip))
+
+
+@pytest.mark.parametrize("biases", [(True, True), (True, False), (False, True), (False, False)])
+@given(inner=channels, middle=channels, height=sides, width=sides, seed=st.integers(0, 1000))
+def test_a_joint_head_is_both_its_steps(
+    biases: tuple[bool, bool], inner: int, middle: int, height: int, width: int, seed: int
+) -> None:
+    torch.manual_seed(seed)
+    up = nn.ConvTranspose2d(inner, middle, 4, stride=2, padding=1, bias=biases[0]).double()
+    head = nn.Conv2d(middle, 1, 3, padding=1, bias=biases[1]).double()
+    x = leaf(2, inner, height, width)
+
+    def merged() -> Tensor:
+        joint = joint_head(up.weight, up.bias, head.weight, head.bias)
+        assert [part.shape for part in joint] == [(4, inner, 3, 3), (4,)]
+        return run_head(up, head, x, joint=joint)
+
+    assert_same(lambda: head(up(x)), merged, [x, *up.parameters(), *head.parameters()])
+
+
+@given(inner=channels, middle=channels, height=st.integers(2, 5), width=st.integers(2, 5), seed=st.integers(0, 1000))
+def test_the_joint_convolution_alone_is_right_inside(
+    inner: int, middle: int, height: int, width: int, seed: int
+) -> None:
+    """And wrong on the outermost pixels, which is why the border takes the two steps."""
+    torch.manual_seed(seed)
+    up, head = nn.ConvTranspose2d(inner, middle, 4, stride=2, padding=1).double(), nn.Conv2d(middle, 1, 3, padding=1)
+    head = head.double()
+    x = leaf(2, inner, height, width)
+    assert up.bias is not None
+    assert head.bias is not None
+    joint = joint_head(up.weight, up.bias, head.weight, head.bias)
+    inside = functional.pixel_shuffle(functional.conv2d(x, *joint, padding=1), 2)
+    expected = head(up(x))
+    torch.testing.assert_close(inside[..., 1:-1, 1:-1], expected[..., 1:-1, 1:-1], rtol=1e-10, atol=1e-12)
+    assert (inside - expected)[..., 0, :].abs().max() > 1e-9
+
+
+@pytest.mark.parametrize(
+    ("up", "head", "usual"),
+    [
+        ({}, {}, True),
+        ({"bias": False}, {"bias": False}, True),
+        ({"kernel_size": 2, "padding": 0}, {}, False),
+        ({"stride": 1}, {}, False),
+        ({}, {"kernel_size": 1, "padding": 0}, False),
+        ({}, {"padding": 0}, False),
+        ({}, {"out_channels": 64}, False),
+    ],
+)
+def test_which_heads_can_be_joined(up: dict[str, int], head: dict[str, int], usual: bool) -> None:
+    first = nn.ConvTranspose2d(
+        **{"in_channels": 4, "out_channels": 2, "kernel_size": 4, "stride": 2, "padding": 1, **up}
+    )
+    second = nn.Conv2d(**{"in_channels": 2, "out_channels": 1, "kernel_size": 3, "padding": 1, **head})
+    assert is_usual_head(first, second) == usual

@@ -38,6 +38,7 @@ def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
     files = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
     expected = {
         "config.yaml", "overrides.txt", "environment.json", "split.json", "status.json", "train.log", "metrics.csv",
+        "times.csv", "scored.json",
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "images/epoch_001.png", "images/epoch_002.png",
         *(f"test/{p}/{name}" for p in ("paper", "eigen") for name in ("metrics.json", "per_image.csv", "panels.png")),
         "test/eigen/strata.csv", "test/eigen/strata.png",
@@ -192,11 +193,20 @@ def assert_equal(a: Any, b: Any) -> None:
         assert a == b
 
 
-def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(tmp_path: Path, cache: Path) -> None:
+RECIPE = (
+    "augment=depth", "augment.cut_depth=0.5", "loss=mixture", "optim=adamw_grouped", "schedule=warmup_cosine",
+    "callbacks=ema", "data.progressive=[{size:[16,32],until:0.5}]", "trainer.gradient_clip_val=1.0",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("recipe", [("schedule=cosine",), RECIPE], ids=["plain", "strong"])
+def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(
+    recipe: tuple[str, ...], tmp_path: Path, cache: Path
+) -> None:
     options = [
         *TINY,
+        *recipe,
         "test=false",
-        "schedule=cosine",
         "callbacks.panels=0",
         "logger=none",
         "trainer.max_epochs=100",
@@ -316,4 +326,7 @@ def test_a_cosine_schedule_has_its_end(command: Command, tmp_path: Path) -> None
     assert command("train", *TINY, "name=cosine", "schedule=cosine", "test=false", "callbacks.panels=0").code == 0
     done = command("train", f"resume={only_run(tmp_path, 'cosine')}", "trainer.max_epochs=4")
     assert done.code == 1
-    assert "resume: the cosine schedule of this run ends at epoch 2" in done.err.splitlines()[-1]
+    assert (
+        "resume: the learning-rate schedule of this run is laid out over 2 epochs, so trainer.max_epochs cannot"
+        in done.err.splitlines()[-1]
+    )
