@@ -34,6 +34,7 @@ from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, chec
 from hudepth.tasks.common import build_data, build_protocols, is_given, without_known_warnings
 from hudepth.tasks.config import plain
 from hudepth.tasks.devices import check_shares
+from hudepth.tasks.launched import shared_path
 from hudepth.tasks.lineage import BEFORE, lineage, refuse_training_pairs
 from hudepth.tasks.resume import resumed_config
 from hudepth.tasks.score import score_checkpoint
@@ -123,7 +124,7 @@ def _run_path(config: dict[str, Any]) -> Path:
         path = Path(HydraConfig.get().runtime.output_dir)
         path.mkdir(parents=True, exist_ok=True)
         return path.resolve()
-    return run_dir.create(config["paths"]["runs"], str(config["name"]))
+    return shared_path(partial(run_dir.create, config["paths"]["runs"], str(config["name"])), config["trainer"])
 
 
 def _run(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> float | None:

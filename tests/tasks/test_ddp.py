@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import socket
 import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -129,3 +132,65 @@ def test_more_processes_than_pairs_give_one_line(command: Command, trained: Path
         "hudepth-test: trainer.devices: the test subset has 2 pairs for 3 processes, each of which needs one. "
         "Pass trainer.devices=2."
     )
+
+
+def torchrun(*arguments: str, folder: Path, cache: Path, node: Sequence[str]) -> subprocess.Popen[str]:
+    """hudepth-train in processes that PyTorch's launcher starts, as on a cluster."""
+    command = script("train", *arguments, cwd=folder, cache=cache)
+    launcher = [sys.executable, "-m", "torch.distributed.run", *node, "--no-python"]
+    return subprocess.Popen(**{**command, "args": [*launcher, *command["args"]]})  # type: ignore[call-overload, misc]
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+def test_processes_of_torchrun_share_one_run_and_have_its_history(no_norm: None, tmp_path: Path, cache: Path) -> None:
+    options = (*TINY, *PAIRS, *NO_NORM, SEVEN, "test=false")
+    alone = trained("alone", *NO_NORM, SEVEN, "data.batch_size=4", "test=false", folder=tmp_path, cache=cache)
+    process = torchrun(
+        *options, *TWO, "name=launched", folder=tmp_path, cache=cache,
+        node=["--nproc-per-node=2", f"--master-port={free_port()}"],
+    )  # fmt: skip
+    out, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, out
+    (launched,) = (tmp_path / "runs" / "launched").iterdir()
+    assert [row.keys() for row in history(launched)] == [row.keys() for row in history(alone)]
+    for ours, theirs in zip(history(launched), history(alone), strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-5)
+
+
+def test_two_machines_share_one_run(no_norm: None, tmp_path: Path, cache: Path) -> None:
+    """Two launchers that know each other by address, as on two machines: here they are both this one."""
+    options = (*TINY, *PAIRS, *NO_NORM, SEVEN, "name=machines", "protocol=paper", "baselines=false")
+    count = ("trainer.devices=1", "trainer.num_nodes=2", "trainer.strategy=ddp")
+    port = free_port()
+    nodes = [
+        torchrun(
+            *options, *count, folder=tmp_path, cache=cache,
+            node=["--nnodes=2", f"--node-rank={rank}", "--nproc-per-node=1", f"--master-port={port}",
+                  "--master-addr=127.0.0.1"],
+        )
+        for rank in (0, 1)
+    ]  # fmt: skip
+    outs = [node.communicate(timeout=240)[0] for node in nodes]
+    assert [node.returncode for node in nodes] == [0, 0], outs
+    (run,) = (tmp_path / "runs" / "machines").iterdir()
+    assert json.loads((run / "status.json").read_text())["state"] == "finished"
+    assert len(history(run)) == 2
+    assert (run / "test" / "paper" / "metrics.json").is_file()
+
+
+def test_launched_processes_must_be_as_many_as_asked_for(tmp_path: Path, cache: Path) -> None:
+    process = torchrun(
+        *TINY, "test=false", folder=tmp_path, cache=cache,
+        node=["--nproc-per-node=2", f"--master-port={free_port()}"],
+    )  # fmt: skip
+    out, _ = process.communicate(timeout=240)
+    assert process.returncode != 0
+    assert (
+        "hudepth-train: trainer.devices=1 trainer.num_nodes=1: that is 1 processes, but 2 were launched together. "
+        "Pass trainer.devices=<processes of each machine> trainer.num_nodes=<machines>."
+    ) in out
