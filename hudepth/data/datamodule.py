@@ -14,10 +14,10 @@ from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.nn import functional
-from torch.utils.data import DataLoader, DistributedSampler
+from torch.utils.data import DataLoader, DistributedSampler, Sampler
 
 from hudepth.data.augment import Augmentation, resize
-from hudepth.data.dataset import ShardSampler, StoreDataset, as_is
+from hudepth.data.dataset import BlockShuffle, ShardSampler, StoreDataset, as_is
 from hudepth.data.prepare import prepare
 from hudepth.data.resolution import read_stages, size_at
 from hudepth.data.sources.base import Source
@@ -47,6 +47,8 @@ class DepthDataModule(LightningDataModule):
             :class:`hudepth.data.teacher.TeacherDepths`); None: no teacher.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
         seed: of the order of training pairs and of augmentation, which depend on nothing but this and the epoch.
+        shuffle_block: shuffle blocks of so many neighbouring pairs, and pairs within a few of them, instead of all: for
+            stores that are larger than memory (:class:`hudepth.data.dataset.BlockShuffle`).
         cache: folder of the depth stores.
         native: keep native-resolution truth in the store, for protocols like ``eigen``.
         on_error: ``raise`` at a bad pair or ``skip`` it.
@@ -71,6 +73,7 @@ class DepthDataModule(LightningDataModule):
         teacher: str | Path | None = None,
         num_workers: int = 0,
         seed: int = 42,
+        shuffle_block: int | None = None,
         cache: str | Path = "~/.cache/hudepth",
         native: bool = True,
         on_error: str = "raise",
@@ -84,6 +87,7 @@ class DepthDataModule(LightningDataModule):
             ("batch_size", batch_size, 1),
             ("num_workers", num_workers, 0),
             ("prepare_workers", prepare_workers, 1),
+            ("shuffle_block", shuffle_block, 1),
         ):
             if value is not None and value < least:
                 raise ConfigError(f"data.{key}: {value} is less than {least}.")
@@ -99,6 +103,7 @@ class DepthDataModule(LightningDataModule):
         self.split_kind, self.split_seed, self.fractions = split, split_seed, tuple(fractions)
         self.max_depth_m = float(max_depth_m)
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.shuffle_block = shuffle_block
         self.cache, self.native = Path(cache), native
         self.on_error, self.prepare_workers = on_error, prepare_workers
         self._store: DepthStore | None = None
@@ -147,9 +152,13 @@ class DepthDataModule(LightningDataModule):
         rank, world_size = self._shard()
         dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
         # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees what it would have seen.
-        sampler: DistributedSampler[int] = DistributedSampler(
+        sampler: Sampler[int] = DistributedSampler(
             dataset, num_replicas=world_size, rank=rank, shuffle=True, seed=self.seed
         )
+        if self.shuffle_block:
+            sampler = BlockShuffle(
+                dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size
+            )
         return self._loader(dataset, sampler)
 
     def val_dataloader(self) -> DataLoader[RawBatch]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch.utils.data import Dataset, Sampler
 
@@ -76,3 +77,45 @@ class ShardSampler(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._positions)
+
+
+class BlockShuffle(Sampler[int]):
+    """Shuffles training pairs so that they are read from the disk in large pieces.
+
+    A store that is larger than memory is read from the disk anew each epoch, where reads far apart are slow. So blocks of
+    neighbouring pairs are shuffled, then the pairs within each group of a few blocks. The order depends on seed and epoch
+    alone. Each process gets every ``world_size``-th pair; where that does not divide, the first ones are seen
+    twice, so that all take as many steps.
+
+    Args:
+        rows: where each pair lies in the store.
+        block: neighbouring pairs that are read together.
+        seed: of the order.
+        rank: of this process.
+        world_size: number of processes.
+        group: blocks whose pairs are mixed; that many lie in memory at once.
+    """
+
+    def __init__(
+        self, rows: Sequence[int], *, block: int, seed: int, rank: int = 0, world_size: int = 1, group: int = 16
+    ) -> None:
+        self.rows = np.asarray(rows)
+        self.block, self.seed, self.rank, self.world_size, self.group = block, seed, rank, world_size, group
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Take another order; Lightning calls this."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return -(-len(self.rows) // self.world_size)
+
+    def __iter__(self) -> Iterator[int]:
+        random = np.random.default_rng((self.seed, self.epoch))
+        sorted_positions = np.argsort(self.rows, kind="stable")
+        blocks = [sorted_positions[i : i + self.block] for i in range(0, len(self.rows), self.block)]
+        blocks = [blocks[i] for i in random.permutation(len(blocks))]
+        groups = [np.concatenate(blocks[i : i + self.group]) for i in range(0, len(blocks), self.group)]
+        order = np.concatenate([random.permutation(group) for group in groups])
+        order = np.resize(order, len(self) * self.world_size)
+        return iter(order[self.rank :: self.world_size].tolist())

@@ -10,7 +10,8 @@ from hudepth.errors import ConfigError
 from hudepth.models.attention import TransformerBlock
 from hudepth.models.decoder import ARITHMETIC, Arithmetic, UpBlock, UpsampleMode, is_usual_head, joint_head, run_head
 from hudepth.models.options import OUTPUTS, choose
-from hudepth.models.resnet import ResNet18Trunk
+from hudepth.models.recompute import recomputed
+from hudepth.models.resnet import ResNet18Trunk, run_stage
 
 STRIDE = 16
 """The trunk's deepest map is 1/16 of the input, so both sides of an image must be multiples of it."""
@@ -34,6 +35,8 @@ class HybridUNet(nn.Module):
         output: from the last convolution to unit depth, one of :data:`hudepth.models.options.OUTPUTS` (not stated).
         arithmetic: ``plain``, or ``merged``: linear steps as one, with a fifth fewer multiplications and the same
             results but for rounding (:mod:`hudepth.models.decoder`).
+        recompute: in training, keep the activations of no stage but compute them again for the gradients: less memory
+            for more time, the same results.
         trunk_norm: batch norm of the trunk: ``trained``, or ``frozen`` to the statistics it starts with.
 
     Raises:
@@ -53,8 +56,10 @@ class HybridUNet(nn.Module):
         output: str = "sigmoid",
         arithmetic: Arithmetic = "plain",
         trunk_norm: str = "trained",
+        recompute: bool = False,
     ) -> None:
         super().__init__()
+        self.recompute = recompute
         on_skip, on_deepest = choose("model.attention", attention, ATTENTION)
         choose("model.upsample", upsample, {"nearest": 0, "bilinear": 0})
         choose("model.arithmetic", arithmetic, dict.fromkeys(ARITHMETIC, 0))
@@ -88,11 +93,12 @@ class HybridUNet(nn.Module):
             ConfigError: if a side is not a multiple of 16; the message gives the nearest sizes that are.
         """
         check_size(*image.shape[-2:])
-        features = self.trunk(image)
-        x = self.attention_deepest(features.layer3)
-        x = self.up1(x, self.attention_skip(features.layer2))
-        x = self.up2(x, features.layer1)
-        x = self.up3(x, features.stem)
+        run = recomputed if self.recompute and self.training else run_stage
+        features = self.trunk(image, run=run)
+        x = run(self.attention_deepest, features.layer3)
+        x = run(self.up1, x, run(self.attention_skip, features.layer2))
+        x = run(self.up2, x, features.layer1)
+        x = run(self.up3, x, features.stem)
         unit_depth: Tensor = self.output(self._head(x))
         return unit_depth
 

@@ -6,8 +6,9 @@ Parameter names are torchvision's, so that its ImageNet file loads as it is.
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 from urllib.error import URLError
 
 import torch
@@ -66,6 +67,11 @@ class BasicBlock(nn.Module):
         return x
 
 
+def run_stage(module: nn.Module, *inputs: Tensor) -> Any:
+    """Return ``module(*inputs)``."""
+    return module(*inputs)
+
+
 class ResNet18Trunk(nn.Module):
     """ResNet-18 without fc, and by default without layer4.
 
@@ -109,13 +115,18 @@ class ResNet18Trunk(nn.Module):
                     module.eval()
         return self
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Features:
-        """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size, and at 1/32 with layer4."""
+    def forward(self, image: Float[Tensor, "b 3 h w"], *, run: Callable[..., Any] = run_stage) -> Features:
+        """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size, and at 1/32 with layer4.
+
+        Args:
+            image: RGB, normalised with ImageNet's statistics.
+            run: how a stage is run, for example :func:`hudepth.models.recompute.recomputed`.
+        """
         stem = self.relu(self.bn1(self.conv1(image)))
-        layer1 = self.layer1(self.maxpool(stem))
-        layer2 = self.layer2(layer1)
-        layer3 = self.layer3(layer2)
-        return Features(stem, layer1, layer2, layer3, None if self.layer4 is None else self.layer4(layer3))
+        layer1 = run(self.layer1, self.maxpool(stem))
+        layer2 = run(self.layer2, layer1)
+        layer3 = run(self.layer3, layer2)
+        return Features(stem, layer1, layer2, layer3, None if self.layer4 is None else run(self.layer4, layer3))
 
 
 def load_trunk_weights(trunk: ResNet18Trunk, weights: str) -> None:

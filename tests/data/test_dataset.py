@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
-from hudepth.data.dataset import ShardSampler, StoreDataset, as_is
+from hudepth.data.dataset import BlockShuffle, ShardSampler, StoreDataset, as_is
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter
 
@@ -87,3 +87,36 @@ def test_the_store_is_found_again_after_pickling(store: DepthStore, tmp_path: Pa
     after = torch.load(tmp_path / "dataset", weights_only=False)[0]
     assert torch.equal(before["image"], after["image"])
     assert torch.equal(before["native_depth"][0], after["native_depth"][0])
+
+
+@given(
+    rows=st.lists(st.integers(0, 10_000), min_size=1, max_size=200, unique=True),
+    block=st.integers(1, 50),
+    world_size=st.integers(1, 4),
+    epoch=st.integers(0, 3),
+)
+def test_block_shuffle_deals_every_pair_once(rows: list[int], block: int, world_size: int, epoch: int) -> None:
+    samplers = [
+        BlockShuffle(rows, block=block, seed=1, rank=rank, world_size=world_size, group=3) for rank in range(world_size)
+    ]
+    for sampler in samplers:
+        sampler.set_epoch(epoch)
+    dealt = [list(sampler) for sampler in samplers]
+    assert {len(each) for each in dealt} == {len(sampler) for sampler in samplers}
+    together = [position for each in zip(*dealt, strict=True) for position in each]
+    assert sorted(together[: len(rows)]) == list(range(len(rows)))
+    assert together[len(rows) :] == together[: len(together) - len(rows)]  # what is left over begins anew
+
+
+def test_block_shuffle_reads_in_pieces_and_anew_each_epoch() -> None:
+    rows = list(range(1000, 0, -1))  # the split's order is not the store's
+    sampler = BlockShuffle(rows, block=10, seed=1, group=5)
+    first = [rows[position] for position in sampler]
+    for start in range(0, 1000, 50):
+        blocks = {(row - 1) // 10 for row in first[start : start + 50]}
+        assert len(blocks) == 5  # whole blocks, five at a time
+    assert first != sorted(first)
+    assert first[:50] != sorted(first[:50], reverse=True)
+    assert first == [rows[position] for position in sampler]
+    sampler.set_epoch(1)
+    assert first != [rows[position] for position in sampler]
