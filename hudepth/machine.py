@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import platform
@@ -19,6 +20,10 @@ INSTRUCTION_SETS = (
 """Of a processor's many, those that decide how fast networks run on it."""
 PACKAGES = ("torch", "onnxruntime", "openvino", "nncf", "transformers")
 """What networks are run with, or made smaller by."""
+
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Options of mallopt, from malloc.h of the GNU C library."""
 
 
 def usable_cores() -> int:
@@ -66,3 +71,21 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+def keep_freed_memory() -> bool:
+    """Let the C library keep memory that is freed, instead of giving it back to the system and asking again.
+
+    A training step allocates the same large tensors over and over. By default each gets new pages, which the system has
+    to clear one by one: a fifth of the time of a step in bfloat16 (``experiments/speed``). The process keeps what it
+    once needed until it ends.
+
+    Returns:
+        Whether it is done: with the GNU C library only.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):  # macOS and musl have none; Windows has no library of this name
+        return False
+    never = 2**31 - 1
+    return bool(mallopt(M_MMAP_THRESHOLD, 2**30) and mallopt(M_TRIM_THRESHOLD, never))

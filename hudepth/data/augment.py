@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hudepth.errors import ConfigError
-from hudepth.losses.badcl import luma
+from hudepth.losses.badcl import BT601_LUMA
 
 MAX_BLUR = 3.0
 """Largest standard deviation of the blur [pixels]."""
@@ -67,15 +67,24 @@ def warp(
     extent = (1 - 2 * geometry.border) / geometry.zoom
     cos, sin = geometry.angle.cos() * extent, geometry.angle.sin() * extent
     mirror = torch.where(geometry.flip, -1.0, 1.0).to(cos)
-    rows = (
-        torch.stack([cos * mirror, -sin / aspect, geometry.centre[:, 0]], dim=1),
-        torch.stack([sin * aspect * mirror, cos, geometry.centre[:, 1]], dim=1),
-    )
-    grid = functional.affine_grid(torch.stack(rows, dim=1), [len(image), 1, *size], align_corners=False)
+    along_x = torch.stack([cos * mirror, sin * aspect * mirror], dim=1)
+    along_y = torch.stack([-sin / aspect, cos], dim=1)
+    grid = _affine_grid(along_x, along_y, geometry.centre, size)
     image = _at_most_twice(image, size)
     image = functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
     depth = functional.grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)
     return image, depth / geometry.zoom[:, None, None, None]
+
+
+def _affine_grid(along_x: Tensor, along_y: Tensor, centre: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return centre + x * along_x + y * along_y for the pixels of an image, [b, h, w, 2] of vectors [b, 2].
+
+    (:func:`torch.nn.functional.affine_grid` multiplies matrices pixel by pixel, which takes 20 times as long.)
+    """
+    height, width = ((2 * torch.arange(n, device=centre.device) + 1) / n - 1 for n in size)
+    columns = width[:, None] * along_x[:, None, :]
+    rows = height[:, None] * along_y[:, None, :] + centre[:, None, :]
+    return rows[:, :, None, :] + columns[:, None, :, :]
 
 
 def resize(
@@ -115,20 +124,30 @@ def change_colours(
         saturation: factor of the difference from each pixel's luma.
         tint: factor of each channel.
     """
+    image = image.clamp(1e-4, 1) ** gamma[:, None, None, None]
+    # What follows is linear in the colours of a pixel: one matrix and one offset for each image.
+    weights = torch.tensor(BT601_LUMA, dtype=image.dtype, device=image.device)
+    scale = brightness[:, None] * tint
+    mean = (scale * image.mean(dim=(2, 3))) @ weights
+    saturate = torch.lerp(weights.expand(3, 3), torch.eye(3).to(image), saturation[:, None, None])
+    matrix = saturate * (contrast[:, None] * scale)[:, None, :]
+    offset = ((1 - contrast) * mean)[:, None, None].expand(-1, 3, 1)
+    return torch.baddbmm(offset, matrix, image.flatten(2)).reshape(image.shape).clamp_(0, 1)
 
-    def each(factor: Tensor) -> Tensor:
-        return factor.reshape(len(image), -1, 1, 1)
 
-    image = image.clamp(1e-4, 1) ** each(gamma) * each(brightness) * each(tint)
-    image = torch.lerp(luma(image).mean(dim=(2, 3), keepdim=True), image, each(contrast))
-    return torch.lerp(luma(image), image, each(saturation)).clamp(0, 1)
+def blur(
+    image: Float[Tensor, "b c h w"], sigma: Float[Tensor, " b"], *, largest: float = MAX_BLUR
+) -> Float[Tensor, "b c h w"]:
+    """Blur each image by a Gaussian of its own standard deviation.
 
-
-def blur(image: Float[Tensor, "b c h w"], sigma: Float[Tensor, " b"]) -> Float[Tensor, "b c h w"]:
-    """Blur each image by a Gaussian of its own standard deviation [pixels], at most :data:`MAX_BLUR`; 0 leaves it."""
-    radius = math.ceil(2 * MAX_BLUR)
+    Args:
+        image: in any unit.
+        sigma: standard deviations [pixels]; 0 leaves an image as it is.
+        largest: that sigma can be; the Gaussians end at two of it.
+    """
+    radius = math.ceil(2 * largest)
     taps = torch.arange(-radius, radius + 1, device=image.device, dtype=image.dtype)
-    kernel = torch.exp(-0.5 * (taps / sigma.clamp(0.05, MAX_BLUR)[:, None]).square())  # at 0.05 all but the centre is 0
+    kernel = torch.exp(-0.5 * (taps / sigma.clamp(0.05, largest)[:, None]).square())  # at 0.05 all but the centre is 0
     kernel = kernel / kernel.sum(dim=1, keepdim=True)
     batch, channels, height, width = image.shape
     kernel = kernel.repeat_interleave(channels, dim=0)[:, None]
@@ -254,7 +273,7 @@ class Augmentation:
             image, unit_depth = resize(image, unit_depth, size=size)
         if self.blur:
             # half of the images stay sharp
-            image = blur(image, (draw.uniform(-self.blur, self.blur)).clamp_min(0))
+            image = blur(image, draw.uniform(-self.blur, self.blur).clamp_min(0), largest=self.blur)
         if self._colours:
             image = change_colours(
                 image,

@@ -82,9 +82,9 @@ class ShardSampler(Sampler[int]):
 class BlockShuffle(Sampler[int]):
     """Shuffles training pairs so that they are read from the disk in large pieces.
 
-    A store that is larger than memory is read from the disk anew each epoch, where reads far apart are slow. So blocks of
-    neighbouring pairs are shuffled, then the pairs within each group of a few blocks. The order depends on seed and epoch
-    alone. Each process gets every ``world_size``-th pair; where that does not divide, the first ones are seen
+    A store that is larger than memory is read from the disk anew each epoch, and reads far apart are slow. So blocks of
+    neighbouring pairs are shuffled, then the pairs within each group of a few blocks. The order depends on seed and
+    epoch alone. Each process gets every ``world_size``-th pair; where that does not divide, the first ones are seen
     twice, so that all take as many steps.
 
     Args:

@@ -28,6 +28,7 @@ from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
 from hudepth.errors import ConfigError, HudepthError, Pruned
 from hudepth.instantiate import instantiate
+from hudepth.machine import keep_freed_memory
 from hudepth.module import DepthModule
 from hudepth.schedules import StepSchedule
 from hudepth.tasks.checks import MEMORY_FORMATS, check_config, check_input, check_monitor
@@ -167,6 +168,7 @@ def _failed(path: Path, message: str) -> None:
 def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> float | None:
     log.info("run directory: %s", path)
     seed_everything(config["seed"], verbose=False)
+    keep_freed_memory()
     trust = list(config["trust"])
     distill = config.get("distill") or {}
     options = {**config["data"], **({"teacher": distill["teacher"]} if is_given(distill) else {})}
