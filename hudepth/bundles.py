@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -21,8 +22,30 @@ from hudepth.errors import CheckpointError
 
 CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
 KIND = "hudepth-bundle"
+PRETRAINED = ("nyu",)
+"""Models that come with hudepth, by the name that ``checkpoint=`` takes: ``nyu`` was trained by experiment/strong."""
 MAX_CONFIG_BYTES = 1 << 22
 MAX_WEIGHTS_BYTES = 1 << 32
+
+
+def pretrained(name: str) -> Path:
+    """Return the folder of a model that comes with hudepth.
+
+    Args:
+        name: one of :data:`PRETRAINED`.
+
+    Raises:
+        CheckpointError: if this installation lacks it.
+    """
+    spec = find_spec("hudepth.pretrained")
+    folders = list(spec.submodule_search_locations or []) if spec else []
+    folder = next((path for root in folders if is_bundle(path := Path(root) / name)), None)
+    if folder is None:
+        raise CheckpointError(
+            f"checkpoint: the weights of '{name}' are not part of this installation. Install hudepth anew, or pass a "
+            "run or a file."
+        )
+    return folder
 
 
 def is_bundle(path: Path) -> bool:

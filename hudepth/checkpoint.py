@@ -118,12 +118,15 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     """Return the file that ``spec`` means.
 
     Args:
-        spec: a file; a run directory (its best checkpoint, else its last); a bundle; or ``last`` (the newest run).
+        spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or the
+            name of a model that comes with hudepth, one of :data:`hudepth.bundles.PRETRAINED`.
         runs: where ``last`` looks.
 
     Raises:
         CheckpointError: if there is no such file.
     """
+    if spec in bundles.PRETRAINED:
+        return bundles.pretrained(spec)
     path = run_dir.newest_run(runs) if spec == "last" else Path(spec).expanduser()
     if bundles.is_bundle(path):
         return path

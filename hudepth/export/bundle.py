@@ -6,6 +6,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def write_bundle(
     checkpoint: Checkpoint,
     *,
     info: ModelInfo,
-    onnx: Path,
+    onnx: Path | None,
     card: str,
     results: Mapping[str, Mapping[str, Any]],
     samples: Sequence[DepthMap],
@@ -38,7 +39,7 @@ def write_bundle(
         folder: is made.
         checkpoint: whose tensors and record go along.
         info: the same in short.
-        onnx: file to copy.
+        onnx: file to copy; None: the bundle has none.
         card: the model card.
         results: contents of ``metrics.json`` by protocol.
         samples: pictures to show.
@@ -58,7 +59,8 @@ def write_bundle(
         "config": config, "split": checkpoint.split, "data": checkpoint.data,
     }  # fmt: skip
     (folder / CONFIG).write_text(json.dumps(stated, indent=2) + "\n", encoding="utf-8")
-    shutil.copyfile(onnx, folder / ONNX)
+    if onnx is not None:
+        shutil.copyfile(onnx, folder / ONNX)
     (folder / CARD).write_text(card, encoding="utf-8")
     for protocol, result in results.items():
         (folder / "metrics").mkdir(exist_ok=True)
@@ -66,6 +68,15 @@ def write_bundle(
     for number, sample in enumerate(samples):
         (folder / "samples").mkdir(exist_ok=True)
         (folder / "samples" / f"{number}.jpg").write_bytes(jpeg(sample.side_by_side()))
+
+
+def halved(checkpoint: Checkpoint) -> Checkpoint:
+    """Return a checkpoint whose kernels and matrices are 16-bit floats: half the size, for about three digits.
+
+    Norms and biases stay as they are: they are few, and variances may lie outside of what 16 bits hold.
+    """
+    state = {name: tensor.half() if tensor.ndim > 1 else tensor for name, tensor in checkpoint.state.items()}
+    return replace(checkpoint, state=state)
 
 
 def zip_folder(folder: Path, path: Path) -> None:

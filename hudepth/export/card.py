@@ -36,8 +36,8 @@ CITATION = """@article{turkmen2025hybrid,
 
 
 def model_card(
-    checkpoint: Checkpoint, info: ModelInfo, *, name: str, results: Mapping[str, Mapping[str, Any]], onnx: str,
-    samples: str,
+    checkpoint: Checkpoint, info: ModelInfo, *, name: str, results: Mapping[str, Mapping[str, Any]], parity: str,
+    samples: str, half: bool = False,
 ) -> str:  # fmt: skip
     """Write the card of a model.
 
@@ -46,15 +46,16 @@ def model_card(
         info: says what it takes and gives.
         name: of the model.
         results: contents of ``metrics.json`` by protocol; may be empty.
-        onnx: how far its ONNX file is from it.
+        parity: how far its ONNX file is from it, or its 16-bit weights are.
         samples: what its pictures show.
+        half: kernels and matrices are kept as 16-bit floats, and there is no ONNX file.
 
     Returns:
         Markdown with the header that model hubs read.
     """
     source = str(checkpoint.data.get("source", "unknown"))
     sections = (
-        _header(source), f"# {name}", _about(info), _use(info, onnx), _training(checkpoint, source),
+        _header(source), f"# {name}", _about(info), _use(info, parity, half=half), _training(checkpoint, source),
         _results(results), samples, _limits(info, source),
         "## Licence\n\nCode: MIT. Training data: "
         + DATA_LICENCES.get(source, f"'{source}', whose terms whoever publishes this model must state here.")
@@ -79,16 +80,24 @@ def _about(info: ModelInfo) -> str:
     )
 
 
-def _use(info: ModelInfo, onnx: str) -> str:
+def _use(info: ModelInfo, parity: str, *, half: bool) -> str:
     height, width = info.size
+    if half:
+        files = (
+            "`model.safetensors` holds kernels and matrices as 16-bit floats and is computed with in 32; against the "
+            f"weights of the training it is {parity}. `config.json` says how to build the network around them."
+        )
+    else:
+        files = (
+            f"`model.onnx` needs no hudepth: input `image` uint8 [batch, {height}, {width}, 3], RGB, the whole image "
+            f"resized to this size (averaged over areas); output `depth_m` float32 [batch, {height}, {width}] in "
+            f"metres. It is {parity}.\n"
+            "`model.safetensors` holds float32 tensors, `config.json` how to build the network around them."
+        )
     return (
         "## Use\n\n```bash\nhudepth-predict checkpoint=<this folder or its zip> input=photos\n```\n\n"
         '```python\nimport hudepth\n\ndepth = hudepth.load("<this folder or its zip>").predict("photo.jpg")\n'
-        "depth.metres  # float32 [height, width], metres along the optical axis\n```\n\n"
-        f"`model.onnx` needs no hudepth: input `image` uint8 [batch, {height}, {width}, 3], RGB, the whole image "
-        f"resized to this size (averaged over areas); output `depth_m` float32 [batch, {height}, {width}] in metres. "
-        f"It is {onnx}.\n"
-        "`model.safetensors` holds float32 tensors, `config.json` how to build the network around them."
+        "depth.metres  # float32 [height, width], metres along the optical axis\n```\n\n" + files
     )
 
 

@@ -16,7 +16,7 @@ from torch import nn
 from hudepth.checkpoint import Checkpoint, load_checkpoint
 from hudepth.console import log
 from hudepth.errors import ConfigError
-from hudepth.export.bundle import write_bundle, zip_folder
+from hudepth.export.bundle import halved, write_bundle, zip_folder
 from hudepth.export.card import model_card
 from hudepth.export.graphs import export_onnx, export_openvino, export_program
 from hudepth.export.parity import Parity, check, compare
@@ -71,10 +71,9 @@ def export(cfg: DictConfig) -> None:
     for key in ("compared", "calibration"):
         whole_number(config, key, default=50, least=1)
     checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
-    device = _cpu()
     net = checkpoint.build_net(trust=config["trust"])
     info = info_of(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size_option(config["size"]))
-    reference = TorchBackend(net, info, device=device)  # as it was trained: what is exported is held against that
+    reference = _backend(net, info)  # as it was trained: what is exported is held against that
     info = replace(info, processing=bool(config["processing"]))
     images = export_images(checkpoint, config, size=info.size)
     output = output_folder(config["output"])
@@ -142,17 +141,23 @@ def _int8(work: Work, output: Path, _tolerance_mm: float) -> dict[str, Any]:
 def _bundle(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
     name = _bundle_name(work.checkpoint, work.config, output)
     info = replace(work.info, processing=True)
-    parity = _compared(work, work.onnx(), backend="onnxruntime", tolerance_mm=tolerance_mm)
+    if work.config["half"]:
+        kept = halved(work.checkpoint)
+        net = kept.build_net(trust=work.config["trust"])
+        onnx, parity = None, compare(_backend(net, work.info), work.reference, work.images.compared)
+    else:
+        kept, onnx = work.checkpoint, work.onnx()
+        parity = _compared(work, onnx, backend="onnxruntime", tolerance_mm=tolerance_mm)
     model = DepthModel(work.reference)
     samples = [model.predict(image) for image in work.images.compared[:: max(1, len(work.images.compared) // 3)][:3]]
     results = _results(work.checkpoint)
     card = model_card(
-        work.checkpoint, info, name=name, results=results, onnx=str(parity),
+        work.checkpoint, info, name=name, results=results, parity=str(parity), half=bool(work.config["half"]),
         samples=f"## Samples\n\n{_pictures(len(samples))}\n\nFrom the {work.images.origin}, not picked by "
         "hand. Left the image at the network's size, right its depth.",
     )  # fmt: skip
     folder = work.folder / name
-    write_bundle(folder, work.checkpoint, info=info, onnx=work.onnx(), card=card, results=results, samples=samples)
+    write_bundle(folder, kept, info=info, onnx=onnx, card=card, results=results, samples=samples)
     if work.config["zip"]:
         zip_folder(folder, work.folder / f"{name}.zip")
         return _keep([work.folder / f"{name}.zip"], output, parity)
@@ -209,8 +214,8 @@ def _tolerance(value: object) -> float:
     return float(value)
 
 
-def _cpu() -> Any:
+def _backend(net: Any, info: ModelInfo) -> TorchBackend:
     import torch
 
     torch.set_num_threads(usable_cores())
-    return torch.device("cpu")
+    return TorchBackend(net, info, device=torch.device("cpu"))

@@ -315,5 +315,7 @@ def test_images_of_ones_own(trained: Path, tmp_path: Path) -> None:
 
 def test_a_card_of_an_untested_model_says_so(trained: Path) -> None:
     checkpoint = load_checkpoint(str(trained))
-    card = model_card(checkpoint, info_of(checkpoint, parameters=1), name="x", results={}, onnx="the same", samples="")
+    card = model_card(
+        checkpoint, info_of(checkpoint, parameters=1), name="x", results={}, parity="the same", samples=""
+    )
     assert "None are on record. `hudepth-test` makes some" in card
