@@ -16,7 +16,8 @@ from hudepth.errors import ConfigError
 class EMA(WeightAveraging):
     """Lightning's weight averaging with a decay that begins low, so that early epochs are not those of the first step.
 
-    After n steps the average is ``d * average + (1 - d) * weights`` with d = min(decay, (1 + n) / (10 + n)). Statistics
+    With each step the average becomes ``d * average + (1 - d) * weights``, d = min(decay, (1 + n) / (10 + n)) after n
+    earlier steps; it begins with the weights of the first. Statistics
     of batch norm are averaged, too. The average validates and draws, and is what ``best.ckpt`` holds; ``last.ckpt``
     holds the weights beside it.
 

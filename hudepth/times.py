@@ -76,8 +76,17 @@ class Times(Callback):
 
 
 def read_times(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a times.csv; none if it is missing or of another form."""
-    if not path.is_file():
+    """Return the rows of a times.csv that are whole; none if it is missing or of another form."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [row for row in csv.DictReader(file) if _is_whole(row)]
+    except (OSError, ValueError):
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return [row for row in csv.DictReader(file) if all(row.get(name) for name in COLUMNS)]
+
+
+def _is_whole(row: dict[str, str]) -> bool:
+    try:
+        _ = [float(row[name]) for name in COLUMNS], int(row["epoch"]), int(row["images"])
+    except (ValueError, KeyError, TypeError):
+        return False
+    return True

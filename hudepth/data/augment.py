@@ -70,9 +70,16 @@ def warp(
     along_x = torch.stack([cos * mirror, sin * aspect * mirror], dim=1)
     along_y = torch.stack([-sin / aspect, cos], dim=1)
     grid = _affine_grid(along_x, along_y, geometry.centre, size)
+    kept = 1 - 2 * geometry.border
     image = _at_most_twice(image, size)
-    image = functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    inside = grid
+    if geometry.border:  # neither a rolled corner nor linear interpolation may reach what was cut off
+        reach = kept - 1 / torch.tensor(image.shape[:-3:-1], device=grid.device)
+        inside = grid.clamp(-reach, reach)
+    image = functional.grid_sample(image, inside, mode="bilinear", padding_mode="border", align_corners=False)
     depth = functional.grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)
+    if geometry.border:
+        depth = torch.where((grid.abs() <= kept).all(dim=-1)[:, None], depth, 0.0)
     return image, depth / geometry.zoom[:, None, None, None]
 
 
@@ -182,7 +189,7 @@ class Augmentation:
         flip: probability of swapping left and right.
         zoom: range of the crop's enlargement, at least 1; its logarithm is uniform. The crop lies anywhere.
         zoom_depth: divide depth by the zoom, as a fixed camera would see it; false leaves depth as it is.
-        rotate_deg: the camera is rolled by up to this, either way [degrees]; less than 45.
+        rotate_deg: the camera is rolled by up to this, either way [degrees]; at most 45.
         border: share of each side that is never looked at, in [0, 0.4].
         gamma: range of the exponent of colours in [0, 1].
         brightness: range of their factor.
@@ -330,10 +337,10 @@ class _Draw:
 
 
 def _range(key: str, values: Sequence[float], *, least: float, most: float) -> tuple[float, float]:
-    usual = isinstance(values, Sequence) and len(values) == 2
+    usual = isinstance(values, Sequence) and len(values) == 2 and all(isinstance(x, int | float) for x in values)
     if not usual or not least <= values[0] <= values[1] <= most:
         raise ConfigError(
-            f"augment.{key}: {list(values) if usual else values!r} is not [lowest,highest] within "
-            f"[{least:g}, {most:g}]. Pass augment.{key}=[1,1] to leave it out."
+            f"augment.{key}: {list(values) if isinstance(values, Sequence) else values!r} is not [lowest,highest] "
+            f"within [{least:g}, {most:g}]. Pass augment.{key}=[1,1] to leave it out."
         )
     return float(values[0]), float(values[1])

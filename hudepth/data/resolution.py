@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +34,7 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
     for number, entry in enumerate(progressive):
         key = f"data.progressive[{number}]"
         try:
-            height, width = (int(side) for side in entry["size"])
+            height, width = (operator.index(side) for side in entry["size"])
             stage = Stage((height, width), float(entry["until"]))
         except (TypeError, ValueError, KeyError) as error:
             raise ConfigError(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import tokenize
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import cv2
 import h5py
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from hudepth.console import track
 from hudepth.data.sources.base import Record
-from hudepth.data.sources.files import PerProcess
+from hudepth.data.sources.files import PerProcess, read_depth
 from hudepth.data.store import DepthStore
 from hudepth.errors import DataError
 from hudepth.files import written_whole
@@ -49,7 +48,12 @@ class TeacherDepths:
         files = _find(root, records)
         self._position = {index: position for position, index in enumerate(rows)}
         self.size = store.size
-        key = [store.path.name, [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files], rows]
+        key = [
+            store.path.name,
+            str(root.resolve()),
+            [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files],
+            rows,
+        ]
         name = f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
         self.path = store.path.with_name(name)
         if not self.path.exists():  # first without the lock, which a cache that can only be read has no place for
@@ -112,15 +116,13 @@ def _prepare(files: Sequence[Path], records: Sequence[Record], store: DepthStore
 
 
 def _read(file: Path) -> NDArray[np.float32]:
-    depth: NDArray[Any] | None = None
-    with suppress(ValueError, OSError, EOFError):  # what is damaged stays None
-        if file.suffix == ".npy":
-            depth = np.load(file, mmap_mode="r", allow_pickle=False)  # mapped: a header may claim anything
-        else:
-            loaded = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-            depth = loaded / np.float32(1000) if loaded is not None and loaded.dtype == np.uint16 else None
-    if depth is None or depth.ndim != 2 or depth.dtype.kind not in "fiu":
+    try:
+        depth = read_depth(file)
+    except (DataError, MemoryError, tokenize.TokenError):  # the last is numpy's, for a header that does not end
+        depth = np.empty(0)
+    wanted = "fiu" if file.suffix == ".npy" else "u"
+    if depth.ndim != 2 or depth.dtype.kind not in wanted or (file.suffix == ".png" and depth.dtype.itemsize != 2):
         raise DataError(
             f"distill.teacher: '{file}' is no depth map: a .npy of numbers [height, width], or a 16-bit grey .png [mm]."
         )
-    return depth.astype(np.float32)
+    return depth.astype(np.float32) / np.float32(1 if file.suffix == ".npy" else 1000)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 
 import torch
@@ -56,4 +57,13 @@ class Mixture(nn.Module):
         """
         parts = {name: loss(pred, target, image, valid) for name, loss in self.losses.items()}
         total = torch.stack([self.weights[name] * part.total for name, part in parts.items()]).sum()
-        return LossTerms(total, {name: term for part in parts.values() for name, term in part.terms.items()})
+        # one that two losses call the same is also called by its loss's name
+        names = Counter(term for part in parts.values() for term in part.terms)
+        return LossTerms(
+            total,
+            {
+                term if names[term] == 1 else f"{name}_{term}": value
+                for name, part in parts.items()
+                for term, value in part.terms.items()
+            },
+        )

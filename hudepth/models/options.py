@@ -47,7 +47,7 @@ class DepthBins(nn.Module):
 
     def forward(self, x: Float[Tensor, "b bins h w"]) -> Float[Tensor, "b 1 h w"]:
         """Return unit depth."""
-        return torch.einsum("bkhw,k->bhw", x.float().softmax(dim=1), self.centres)[:, None]
+        return torch.einsum("bkhw,k->bhw", x.float().softmax(dim=1), self.centres.float())[:, None]
 
 
 OUTPUTS: Mapping[str, Callable[[], nn.Module]] = {

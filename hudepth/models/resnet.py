@@ -105,6 +105,7 @@ class ResNet18Trunk(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         if weights not in (None, "none"):
             load_trunk_weights(self, weights)
+        self.train()  # frozen norms are to be so from the start
 
     def train(self, mode: bool = True) -> ResNet18Trunk:
         """Switch to training mode, but for batch norm if that is frozen."""

@@ -26,7 +26,8 @@ def make_case(
 
 def standard(x: NDArray[Any]) -> NDArray[Any]:
     centred = x - x.mean()
-    return centred / (np.abs(centred).mean() + 1e-6)
+    result: NDArray[Any] = centred / (np.abs(centred).mean() + 1e-6)
+    return result
 
 
 def oracle(kind: str, pred: Tensor, teacher: Tensor) -> float:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_an_up_block_of_merged_arithmetic_is_the_same_block(
     training: bool, coarse: int, fine: int, out: int, height: int, width: int, seed: int
 ) -> None:
     torch.manual_seed(seed)
-    blocks = [UpBlock(coarse, fine, out, arithmetic=how).double().train(training) for how in ("plain", "merged")]  # type: ignore[arg-type]
+    blocks = [UpBlock(coarse, fine, out, arithmetic=how).double().train(training) for how in ("plain", "merged")]
     assert [block.merged for block in blocks] == [False, True]
     for bn in (blocks[0].bn1, blocks[0].bn2):
         nn.init.normal_(bn.weight)
@@ -159,7 +160,7 @@ def test_an_up_block_of_merged_arithmetic_is_the_same_block(
 
 def test_bilinear_up_blocks_stay_plain() -> None:
     torch.manual_seed(0)
-    merged, plain = (UpBlock(2, 2, 2, upsample="bilinear", arithmetic=how) for how in ("merged", "plain"))  # type: ignore[arg-type]
+    merged, plain = (UpBlock(2, 2, 2, upsample="bilinear", arithmetic=how) for how in ("merged", "plain"))
     assert not merged.merged
     plain.load_state_dict(merged.state_dict())
     x, skip = torch.randn(1, 2, 3, 3), torch.randn(1, 2, 6, 6)
@@ -214,7 +215,7 @@ def test_the_joint_convolution_alone_is_right_inside(
         ({}, {"out_channels": 64}, False),
     ],
 )
-def test_which_heads_can_be_joined(up: dict[str, int], head: dict[str, int], usual: bool) -> None:
+def test_which_heads_can_be_joined(up: dict[str, Any], head: dict[str, Any], usual: bool) -> None:
     first = nn.ConvTranspose2d(
         **{"in_channels": 4, "out_channels": 2, "kernel_size": 4, "stride": 2, "padding": 1, **up}
     )

@@ -80,7 +80,6 @@ def test_half_precision_costs_only_the_rounding_of_the_input(build: Callable[[],
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
-@pytest.mark.xfail(strict=True, reason="the depths are cast with the network, what they are multiplied with is not")
 def test_bins_of_a_network_in_another_precision(dtype: torch.dtype) -> None:
     x = make_case(64).to(dtype)
     torch.testing.assert_close(DepthBins().to(dtype)(x), DepthBins()(x.float()), rtol=5e-3, atol=0, check_dtype=False)
