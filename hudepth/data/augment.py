@@ -188,6 +188,7 @@ class Augmentation:
     Args:
         flip: probability of swapping left and right.
         zoom: range of the crop's enlargement, at least 1; its logarithm is uniform. The crop lies anywhere.
+        zoom_chance: probability of zooming at all; else the whole image is seen.
         zoom_depth: divide depth by the zoom, as a fixed camera would see it; false leaves depth as it is.
         rotate_deg: the camera is rolled by up to this, either way [degrees]; at most 45.
         border: share of each side that is never looked at, in [0, 0.4].
@@ -211,6 +212,7 @@ class Augmentation:
         *,
         flip: float = 0.0,
         zoom: Sequence[float] = (1.0, 1.0),
+        zoom_chance: float = 1.0,
         zoom_depth: bool = True,
         rotate_deg: float = 0.0,
         border: float = 0.0,
@@ -226,7 +228,7 @@ class Augmentation:
         cut_depth_size: float = 0.75,
     ) -> None:
         for key, value, most in (
-            ("flip", flip, 1.0), ("grey", grey, 1.0), ("cut_depth", cut_depth, 1.0),
+            ("flip", flip, 1.0), ("zoom_chance", zoom_chance, 1.0), ("grey", grey, 1.0), ("cut_depth", cut_depth, 1.0),
             ("cut_depth_size", cut_depth_size, 1.0), ("tint", tint, 0.5), ("noise", noise, 1.0),
             ("blur", blur, MAX_BLUR), ("rotate_deg", rotate_deg, 45.0),
         ):  # fmt: skip
@@ -242,6 +244,7 @@ class Augmentation:
         self.brightness = _range("brightness", brightness, least=0.0, most=10.0)
         self.contrast = _range("contrast", contrast, least=0.0, most=10.0)
         self.saturation = _range("saturation", saturation, least=0.0, most=10.0)
+        self.zoom_chance = zoom_chance
         self.flip, self.zoom_depth, self.rotate, self.border = flip, zoom_depth, math.radians(rotate_deg), border
         self.tint, self.grey, self.noise, self.blur = tint, grey, noise, blur
         self.cut_depth, self.cut_depth_size = cut_depth, cut_depth_size
@@ -298,7 +301,7 @@ class Augmentation:
         return image, unit_depth
 
     def _draw_geometry(self, draw: _Draw) -> Geometry:
-        zoom = draw.log_uniform(*self.zoom)
+        zoom = torch.where(draw.chance(self.zoom_chance), draw.log_uniform(*self.zoom), 1.0)
         room = (1 - 2 * self.border) * (1 - 1 / zoom)
         return Geometry(
             zoom=zoom,

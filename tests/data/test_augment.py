@@ -685,3 +685,13 @@ def test_a_number_in_the_place_of_a_range() -> None:
     assert str(caught.value) == (
         "augment.zoom: 1.5 is not [lowest,highest] within [1, 8]. Pass augment.zoom=[1,1] to leave it out."
     )
+
+
+def test_some_images_are_not_zoomed_at_all() -> None:
+    image, depth = torch.rand(200, 3, 8, 8), torch.ones(200, 1, 8, 8)
+    augment = Augmentation(zoom=(2.0, 4.0), zoom_chance=0.3)
+    seen, moved = augment(image, depth, size=(8, 8), aspect=1.0, generator=torch.Generator().manual_seed(0))
+    whole = moved[:, 0, 0, 0] == 1
+    assert 0.6 < whole.float().mean() < 0.8
+    torch.testing.assert_close(seen[whole], image[whole])
+    assert (moved[~whole] <= 0.5).all()
