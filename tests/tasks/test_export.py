@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import hudepth
@@ -319,3 +320,32 @@ def test_a_card_of_an_untested_model_says_so(trained: Path) -> None:
         checkpoint, info_of(checkpoint, parameters=1), name="x", results={}, parity="the same", samples=""
     )
     assert "None are on record. `hudepth-test` makes some" in card
+
+
+def test_a_bundle_of_half_the_size(command: Command, trained: Path, tmp_path: Path) -> None:
+    for name, half in (("whole", "false"), ("small", "true")):
+        done = command("export", f"checkpoint={trained}", "format=bundle", f"name={name}", f"half={half}", "compared=4")
+        assert done.code == 0, done.err
+    whole, small = (tmp_path / "export" / name for name in ("whole", "small"))
+    assert (whole / "model.onnx").is_file()
+    assert not (small / "model.onnx").exists()
+    tensors, kept = load_checkpoint(str(whole)).state, load_checkpoint(str(small)).state
+    for name, tensor in tensors.items():
+        assert kept[name].dtype == (torch.float16 if tensor.ndim > 1 else tensor.dtype), name
+        assert torch.equal(kept[name].to(tensor.dtype), tensor.half().to(tensor.dtype) if tensor.ndim > 1 else tensor)
+    card = (small / "README.md").read_text()
+    assert "holds kernels and matrices as 16-bit floats" in card
+    assert "model.onnx" not in card
+    theirs, ours = (hudepth.load(str(folder)).predict(IMAGE).metres for folder in (whole, small))
+    assert 0 < np.abs(ours - theirs).max() < 0.05  # metres
+    assert hudepth.load(str(small)).backend.name.startswith("torch")
+
+
+def test_a_model_that_does_not_come_along_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hudepth.bundles.find_spec", lambda _: None)
+    with pytest.raises(CheckpointError) as caught:
+        hudepth.load("nyu")
+    assert str(caught.value) == (
+        "checkpoint: the weights of 'nyu' are not part of this installation. Install hudepth anew, or pass a run or a "
+        "file."
+    )
