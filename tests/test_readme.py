@@ -67,7 +67,7 @@ def shortened(command: str) -> list[str]:
     if words[0] != "hudepth-train" or {"--help", "--cfg"} & set(words) or "resume=" in command:
         return words
     rooms = [] if "data=" in command else ["data.source.scenes=6", "data.source.size=[48,64]"]
-    weights = ["model.weights=none"] if "experiment=badcl" in command else []
+    weights = ["model.weights=none"] if re.search("experiment=(badcl|strong)", command) else []
     return [w for w in words if not w.startswith("trainer.max_epochs")] + SMALL + rooms + weights
 
 

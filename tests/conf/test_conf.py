@@ -81,7 +81,7 @@ def jobs_of(name: str, *typed: str) -> list[Job]:
     parser = OverridesParser.create()
     params = parser.parse_overrides([f"{key}={values}" for key, values in sweeper.get("params", {}).items()])
     jobs = combine(parser.parse_overrides(list(typed)), params, sweeper.get("variants", {}))
-    return compose_jobs(jobs, lambda overrides: composed(*overrides), str)
+    return compose_jobs(jobs, lambda overrides: composed(f"+sweep={name}", *overrides), str)
 
 
 @pytest.mark.parametrize(
@@ -93,6 +93,7 @@ def jobs_of(name: str, *typed: str) -> list[Job]:
         ("architecture", 9),
         ("seeds", 5),
         ("lambda_grid", 27),
+        ("recipe", 22),
     ],
 )
 def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> None:
@@ -125,6 +126,7 @@ def test_every_sweep_runs(
     name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     more = {
+        "recipe": ["seed=1", "model.weights=none"],
         "attention": ["seed=1"], "architecture": ["seed=1", "data.size=[64,64]"], "seeds": ["seed=1,2", "model=tiny"],
         "lambda_grid": ["loss.boundary=3.0", "loss.smoothness=0.6,1.2", "loss.scaling=1", "model=tiny"],
         "lambda_search": ["hydra.sweeper.search.trials=2", "model=tiny"],

@@ -14,9 +14,9 @@ from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.sources.raycast import F32, Intrinsics, nyu_intrinsics, pinhole_view
 from hudepth.data.sources.rooms_fittings import CATEGORIES
 from hudepth.data.sources.rooms_materials import noise
-from hudepth.data.sources.rooms_scene import build_room
+from hudepth.data.sources.rooms_scene import VARIETIES, build_room
 from hudepth.data.sources.rooms_shading import render
-from hudepth.errors import ConfigError, DataError
+from hudepth.errors import ConfigError, DataError, did_you_mean
 
 RENDERER_VERSION = 1
 """Raise it whenever a change alters any frame: prepared data with another version is out of date."""
@@ -39,6 +39,8 @@ class RoomsSource(Source):
         frames_per_scene: at least 1.
         size: (height, width) in pixels, each 16 to 2048. The field of view is NYU's whatever the size.
         seed: at least 0; another seed gives other rooms.
+        variety: ``usual``, or ``wide``: rooms of more sizes, fuller, seen from nearer, farther, lower, higher and more
+            steeply. To train on for real images: depths spread more as in NYU Depth V2.
         holes: take depth away (0) where a Kinect would not measure: in its projector's shadow, on grazing and
             dark surfaces, beyond 8 m, along the border, and in blobs. All else stays the same.
 
@@ -56,6 +58,7 @@ class RoomsSource(Source):
         frames_per_scene: int = 5,
         size: tuple[int, int] | list[int] = (240, 320),
         seed: int = 0,
+        variety: str = "usual",
         holes: bool = False,
     ) -> None:
         self.scenes = _whole("scenes", scenes, at_least=1)
@@ -67,6 +70,11 @@ class RoomsSource(Source):
                 f"data.source.size: got {size!r}. Pass [height, width], two whole numbers from {low} to {high}, "
                 "for example [240, 320]."
             )
+        if variety not in VARIETIES:
+            raise ConfigError(
+                f"data.source.variety: no '{variety}'.{did_you_mean(str(variety), VARIETIES)} Pass usual or wide."
+            )
+        self.variety = variety
         if not isinstance(holes, bool):
             raise ConfigError(f"data.source.holes: got {holes!r}. Pass true or false.")
         self.size = (size[0], size[1])
@@ -88,7 +96,7 @@ class RoomsSource(Source):
             DataError: if the record is not one of this source's.
         """
         scene = self._scene_number(record)
-        room = build_room(self.seed, scene)
+        room = build_room(self.seed, scene, self.variety)
         height, width = self.size
         view = pinhole_view(*room.path.pose(record.frame), height=height, width=width)
         frame_seed = np.random.SeedSequence([self.seed, scene, record.frame])
@@ -100,7 +108,8 @@ class RoomsSource(Source):
 
     def fingerprint(self) -> str:
         """sha256 over the records, everything else the frames depend on, and the renderer's version."""
-        options = json.dumps([super().fingerprint(), self.size, self.seed, self.holes, RENDERER_VERSION])
+        variety = [] if self.variety == "usual" else [self.variety]
+        options = json.dumps([super().fingerprint(), self.size, self.seed, self.holes, RENDERER_VERSION, *variety])
         return hashlib.sha256(options.encode()).hexdigest()
 
     def _record(self, scene: int, frame: int) -> Record:

@@ -15,7 +15,31 @@ from hudepth.data.sources.rooms_materials import room_materials
 from hudepth.data.sources.rooms_shading import Light, Scene, shadow_map
 
 _WALL_CLEARANCE_M = 0.35
-_COVERED_FLOOR = 0.38
+
+
+class Habits(NamedTuple):
+    """How rooms are furnished and looked at."""
+
+    covered_floor: float
+    """Share of the floor that furniture is put on, if it fits."""
+    long_m: tuple[float, float]
+    """Range of a room's longer side [m]; living rooms and offices reach 9 m in any case."""
+    distance_m: tuple[float, float]
+    """Range of the median depth that a camera looks for [m]."""
+    near_m: float
+    """What is nearer counts as in the way [m]."""
+    height_m: tuple[float, float]
+    """Range of the camera's height [m]."""
+    pitch: tuple[float, float]
+    """Range of the camera's pitch [radians]; negative looks down."""
+
+
+VARIETIES = {
+    "usual": Habits(0.38, (3.6, 6.0), (1.8, 3.6), 0.9, (1.1, 1.7), (-0.28, -0.08)),
+    "wide": Habits(0.55, (3.0, 9.0), (1.0, 5.0), 0.5, (0.7, 1.9), (-0.6, 0.05)),
+}
+"""``usual`` rooms, seen as one would photograph them; and ``wide``: small, large and full ones, seen from near and far,
+with a spread of depths like that of NYU Depth V2."""
 
 
 class CameraPath(NamedTuple):
@@ -48,10 +72,11 @@ class Room(NamedTuple):
 class _Furnisher:
     """Collects the parts of a room and keeps the pieces apart."""
 
-    def __init__(self, rng: Rng, category: str) -> None:
-        self.rng = rng
-        long = rng.uniform(3.6, 9.0 if category in ("living_room", "office") else 6.0)
-        short = rng.uniform(3.0, min(5.0, np.sqrt(96 - long**2)))  # keeps every depth below 10 m
+    def __init__(self, rng: Rng, category: str, habits: Habits) -> None:
+        self.rng, self.habits = rng, habits
+        shortest, longest = habits.long_m
+        long = rng.uniform(shortest, 9.0 if category in ("living_room", "office") else longest)
+        short = rng.uniform(min(3.0, long), min(5.0, np.sqrt(96 - long**2)))  # keeps every depth below 10 m
         x, z = (long, short) if rng.random() < 0.5 else (short, long)
         self.size = np.array([x, rng.uniform(2.4, 2.9), z])
         self.low, self.high = np.empty((0, 3)), np.empty((0, 3))
@@ -136,10 +161,10 @@ def _furnish(room: _Furnisher, category: str) -> None:
         room.put_at_wall(fittings.window(rng))
     room.put_free(FREE[category][0](rng))
     for make in WALL[category] + [WALL[category][i] for i in rng.permutation(len(WALL[category]))]:
-        if room.covered() < _COVERED_FLOOR:
+        if room.covered() < room.habits.covered_floor:
             room.put_at_wall(make(rng))
     for _ in range(5):
-        if room.covered() < _COVERED_FLOOR:
+        if room.covered() < room.habits.covered_floor:
             room.put_free(FREE[category][int(rng.integers(len(FREE[category])))](rng))
     for _ in range(int(rng.integers(2, 7))):
         room.put_at_wall(fittings.picture(rng))
@@ -154,8 +179,8 @@ def _furnish(room: _Furnisher, category: str) -> None:
 
 def _choose_path(room: _Furnisher, solids: Solids) -> CameraPath:
     """Of a few places and directions, take the one that shows most furniture near a distance usual in NYU."""
-    rng, size = room.rng, room.size
-    distance_m = rng.uniform(1.8, 3.6)
+    rng, size, habits = room.rng, room.size, room.habits
+    distance_m = rng.uniform(*habits.distance_m)
     best, path = -np.inf, None
     places = rng.uniform(0.05, 0.95, (160, 2)) * size[[0, 2]]
     gaps = room.clearance(places)
@@ -167,22 +192,23 @@ def _choose_path(room: _Furnisher, solids: Solids) -> CameraPath:
         away = np.arctan2(size[0] / 2 - x, size[2] / 2 - z) + rng.normal(0, 0.4)
         sway = min(max(gaps[i] - 0.25, 0.0), 0.5) / np.sqrt(2)
         candidate = CameraPath(
-            centre=np.array([x, rng.uniform(1.1, 1.7), z]),
+            centre=np.array([x, rng.uniform(*habits.height_m), z]),
             sway=np.array([sway, 0.08, sway]),
             phase=rng.uniform(0, 2 * np.pi, 6),
             yaw=float(away),
-            pitch=float(rng.uniform(-0.28, -0.08)),
+            pitch=float(rng.uniform(*habits.pitch)),
         )
-        score = min(_score(candidate.pose(frame), size, outline, distance_m=distance_m) for frame in (0, 4))
+        poses = (candidate.pose(frame) for frame in (0, 4))
+        score = min(_score(pose, size, outline, distance_m=distance_m, near_m=habits.near_m) for pose in poses)
         if score > best:
             best, path = score, candidate
     assert path is not None
     return path
 
 
-def _score(pose: tuple[F64, F64], size: F64, solids: Solids, *, distance_m: float) -> float:
+def _score(pose: tuple[F64, F64], size: F64, solids: Solids, *, distance_m: float, near_m: float) -> float:
     depth, surface = trace(pinhole_view(*pose, height=12, width=16), size, solids)
-    blocked = float((depth < 0.9).mean())
+    blocked = float((depth < near_m).mean())
     variety = len(np.unique(surface)) / 15
     return variety - 6 * blocked - abs(float(np.median(depth)) - distance_m)
 
@@ -199,12 +225,13 @@ def _lights(rng: Rng, size: F64) -> tuple[Light, Light, F64]:
 
 
 @lru_cache(maxsize=4)
-def build_room(seed: int, scene: int) -> Room:
-    """Furnish room number ``scene``; the same on every call, in every process."""
+def build_room(seed: int, scene: int, variety: str = "usual") -> Room:
+    """Furnish room number ``scene`` by the habits of a variety; the same on every call, in every process."""
+    habits = VARIETIES[variety]
     category = CATEGORIES[scene % len(CATEGORIES)]
     # spawn_key: without it the stream would be frame 0's, since SeedSequence pads its entropy with zeros.
     rng = np.random.default_rng(np.random.SeedSequence([seed, scene], spawn_key=(0,)))
-    room = _Furnisher(rng, category)
+    room = _Furnisher(rng, category, habits)
     _furnish(room, category)
     materials = room_materials(rng, category)
     names = list(materials)
