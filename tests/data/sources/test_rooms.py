@@ -344,3 +344,27 @@ def test_a_record_of_another_source_is_refused(change: dict[str, Any]) -> None:
         f"rooms: no frame '{record.id}' in 2 scenes of 2 frames. "
         "Pass a record that records() of the same source returned."
     )
+
+
+def test_wide_rooms_are_other_rooms_with_a_wider_spread_of_depths_below_ten_metres() -> None:
+    def depths(variety: str) -> np.ndarray[Any, Any]:
+        source = RoomsSource(scenes=40, frames_per_scene=1, size=(24, 32), variety=variety)
+        return np.stack([source.read(record).depth for record in source.records()])
+
+    usual, wide = depths("usual"), depths("wide")
+    spread = [np.quantile(depth, 0.95) / np.quantile(depth, 0.05) for depth in (usual, wide)]
+    assert spread[1] > 1.3 * spread[0]
+    assert 0.1 < wide.min() < wide.max() < 10
+    assert RoomsSource(variety="wide").fingerprint() != RoomsSource().fingerprint()
+
+
+def test_wide_rooms_look_down_and_up_as_nyu_does() -> None:
+    heights = [build_room(0, scene, "wide").path.centre[1] for scene in range(30)]
+    assert min(heights) < 1.0 < 1.7 < max(heights)
+    assert max(build_room(0, scene).path.pitch for scene in range(30)) < 0
+
+
+def test_an_unknown_variety_is_named() -> None:
+    with pytest.raises(ConfigError) as caught:
+        RoomsSource(variety="wild")
+    assert str(caught.value) == "data.source.variety: no 'wild'. Did you mean 'wide'? Pass usual or wide."
