@@ -10,7 +10,7 @@ from hudepth.inference.model import DepthModel, load
 from hudepth.tasks.config import size_option
 from hudepth.viz.point_cloud import Intrinsics
 
-OPTIONS = ("backend", "device", "precision", "threads", "size", "fit", "trust")
+OPTIONS = ("backend", "device", "precision", "threads", "size", "fit", "flip", "trust")
 """Keys that are arguments of :func:`hudepth.inference.model.load`."""
 
 

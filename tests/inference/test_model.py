@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hudepth.inference.info import ModelInfo
+from hudepth.inference.model import DepthModel
+
+
+class Columns:
+    """Predicts the brightness of a pixel plus a tenth of its column: what mirroring changes."""
+
+    name = "columns"
+
+    def __init__(self, info: ModelInfo) -> None:
+        self.info = info
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+        return (rgb.mean(-1) + 0.1 * np.arange(rgb.shape[2])).astype(np.float32)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_flipping_averages_with_the_mirrored_image_mirrored_back(grey: DepthModel, count: int) -> None:
+    backend = Columns(grey.info)
+    images = list(np.random.default_rng(0).integers(0, 255, (count, *grey.info.size, 3), np.uint8))
+    plain = DepthModel(backend).predict_many(images, batch_size=2)
+    flipped = DepthModel(backend, flip=True).predict_many(images, batch_size=2)
+    width = grey.info.size[1]
+    for image, before, after in zip(images, plain, flipped, strict=True):
+        np.testing.assert_allclose(before.metres, image.mean(-1) + 0.1 * np.arange(width), rtol=1e-5)
+        np.testing.assert_allclose(after.metres, image.mean(-1) + 0.1 * (width - 1) / 2, rtol=1e-5)
