@@ -20,6 +20,7 @@ FILES = sorted(CONF.rglob("*.yaml"))
 SMALL = (
     "data.size=[32,48]", "data.source.scenes=6", "data.source.frames_per_scene=2", "data.source.size=[48,64]",
     "data.batch_size=2", "callbacks.panels=1", "trainer.accelerator=cpu", "trainer.max_epochs=1",
+    "data.fractions=[0.6,0.2,0.2]",
 )  # fmt: skip
 
 
