@@ -31,6 +31,8 @@ def check_config(config: dict[str, Any]) -> None:
             f"memory_format: no '{layout}'.{did_you_mean(str(layout), MEMORY_FORMATS)} "
             "Pass contiguous or channels_last."
         )
+    if not isinstance(config.get("compile", False), bool):
+        raise ConfigError(f"compile: {config['compile']!r} is neither true nor false.")
     name = config["name"]
     if name is None or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", str(name)) or ".." in str(name).split("/"):
         raise ConfigError(f"name: {name!r} cannot name a folder of runs. Use letters, digits, '.', '_' and '-'.")

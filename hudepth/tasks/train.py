@@ -196,6 +196,8 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
         before = load_checkpoint(str(path / run_dir.CHECKPOINTS / run_dir.LAST)).data.get(BEFORE, [])
     elif config.get("init"):
         before = start_from(net, str(config["init"]), datamodule)
+    if config.get("compile"):
+        net.compile()  # in place: names of parameters, and so checkpoints, stay as they are
     module = build_module(config, net, datamodule, trust=trust, before=before)
     check_monitor(config["monitor"], module)
     callbacks = build_callbacks(config, path, datamodule)

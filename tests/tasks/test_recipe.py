@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 from hudepth.checkpoint import load_checkpoint
 from hudepth.data.store import DepthStore
 
-from .conftest import TINY, Command
+from .conftest import TINY, Command, script
 
 QUIET = (*TINY, "callbacks.panels=0", "logger=none")
 
@@ -125,6 +126,21 @@ def test_augmentation_that_leaves_nothing_stops_with_the_pairs(
         "hudepth-train: augmentation left no measured pixel in epoch 1, batch 0 (step 1), of the pairs room_"
     )
     assert line.endswith("Lower augment.zoom, augment.rotate_deg or augment.border, or raise data.batch_size.")
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
+def test_a_compiled_network_trains_to_the_same_and_its_checkpoint_is_like_any_other(
+    tmp_path: Path, cache: Path
+) -> None:
+    for name, compiled in (("eager", "false"), ("compiled", "true")):
+        options = (*QUIET, f"name={name}", f"compile={compiled}", "callbacks=ema", "test=false")
+        # a process of its own: the checks of shapes that run in this one cannot be traced
+        done = subprocess.run(**script("train", *options, cwd=tmp_path, cache=cache), check=False, timeout=240)
+        assert done.returncode == 0, done.stdout
+    eager, compiled_run = (load_checkpoint(str(only_run(tmp_path, name))) for name in ("eager", "compiled"))
+    assert eager.state.keys() == compiled_run.state.keys()
+    for name, value in eager.state.items():
+        torch.testing.assert_close(compiled_run.state[name], value, rtol=1e-3, atol=1e-4)
 
 
 def test_training_can_start_from_another_run(command: Command, tmp_path: Path) -> None:
