@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -106,7 +108,8 @@ class HybridUNet(nn.Module):
         if not self.merged:
             result: Tensor = self.head(self.head_up(x))
             return result
-        with torch.autocast(x.device.type, enabled=False):  # sums of many small products: in full precision
+        # sums of many small products, in full precision; autocast knows nothing of devices without numbers
+        with nullcontext() if x.is_meta else torch.autocast(x.device.type, enabled=False):
             joint = joint_head(self.head_up.weight, self.head_up.bias, self.head.weight, self.head.bias)
         return run_head(self.head_up, self.head, x, joint=joint)
 

@@ -432,3 +432,10 @@ def test_unknown_arithmetic() -> None:
     with pytest.raises(ConfigError) as caught:
         bare(HybridUNet.__new__(HybridUNet), arithmetic="merge")  # type: ignore[arg-type]
     assert str(caught.value) == ("model.arithmetic: no 'merge'. Did you mean 'merged'? Pass one of plain, merged.")
+
+
+@pytest.mark.parametrize("arithmetic", ["plain", "merged"])
+def test_a_network_without_numbers_knows_its_shapes(arithmetic: str) -> None:
+    with torch.device("meta"):
+        net = HybridUNet(arithmetic=arithmetic)
+        assert net(torch.empty(2, 3, 32, 48)).shape == (2, 1, 32, 48)

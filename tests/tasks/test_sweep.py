@@ -116,12 +116,15 @@ def test_a_job_that_is_refused_before_it_starts_leaves_a_status_too(command: Com
 def test_a_value_that_does_not_compose_stops_no_other(command: Command, tmp_path: Path) -> None:
     done = sweep(command, "loss=l1,l3")
     assert done.code == 1
-    line = "loss=l3: loss: no 'l3'. Pass one of badcl, berhu, l1, l2, silog."
+    line = "loss=l3: loss: no 'l3'. Pass one of badcl, berhu, gradient, l1, l2, mixture, silog."
     assert done.err.splitlines()[0] == line
     assert done.err.splitlines()[-1] == f"hudepth-train: 1 of 2 jobs failed: {line} See s/*/train.log."
     assert states(tmp_path / "s") == {"l1": "finished"}
     assert [job for job in read_jobs(tmp_path / "s")["tried"] if "run" not in job] == [
-        {"labels": {"loss": "l3"}, "error": "loss: no 'l3'. Pass one of badcl, berhu, l1, l2, silog."}
+        {
+            "labels": {"loss": "l3"},
+            "error": "loss: no 'l3'. Pass one of badcl, berhu, gradient, l1, l2, mixture, silog.",
+        }
     ]
 
 
@@ -129,7 +132,7 @@ def test_nothing_is_made_where_no_job_composes(command: Command, tmp_path: Path)
     done = sweep(command, "loss=l3,l4")
     assert done.code == 1
     assert done.err.splitlines() == [
-        "hudepth-train: loss: no 'l3'. Pass one of badcl, berhu, l1, l2, silog. (so with all 2 jobs)"
+        "hudepth-train: loss: no 'l3'. Pass one of badcl, berhu, gradient, l1, l2, mixture, silog. (so with all 2 jobs)"
     ]
     assert list(tmp_path.iterdir()) == []
 
