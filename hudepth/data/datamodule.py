@@ -251,10 +251,10 @@ def preprocess(
     """
     image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format) / 255
     unit_depth = batch["depth_mm"].to(torch.float32)[:, None] / (1000 * max_depth_m)
+    had_truth = unit_depth > 0
     if "teacher_m" in batch:
         unit_depth = torch.cat([unit_depth, batch["teacher_m"][:, None] / max_depth_m], dim=1)  # moved as the truth is
     size = size or (image.shape[-2], image.shape[-1])
-    measured = (unit_depth > 0).any()
     image, depths = (augment or resize)(image, unit_depth, size=size)
     unit_depth = depths[:, :1]
     result = Batch(
@@ -264,7 +264,7 @@ def preprocess(
         index=batch["index"],
     )
     if augment is not None:
-        result["emptied"] = measured & ~result["valid"].any()
+        result["emptied"] = had_truth.any() & ~result["valid"].any()
     if "teacher_m" in batch:
         result["teacher"] = depths[:, 1:]
     if "native_depth" in batch:

@@ -284,3 +284,20 @@ def test_options_out_of_range_are_refused_at_once(make: Make, options: dict[str,
     with pytest.raises(ConfigError) as caught:
         make(**options)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(("truth", "left", "emptied"), [(900, 0, True), (900, 900, False), (0, 0, False)])
+def test_a_batch_is_emptied_only_if_it_had_truth_to_lose_whatever_its_teacher_says(
+    truth: int, left: int, emptied: bool
+) -> None:
+    raw = RawBatch(
+        image=torch.zeros(1, 4, 4, 3, dtype=torch.uint8),
+        depth_mm=torch.full((1, 4, 4), truth).to(torch.uint16),
+        index=torch.tensor([0]),
+        teacher_m=torch.ones(1, 4, 4),
+    )
+
+    def augment(image: torch.Tensor, depth: torch.Tensor, *, size: tuple[int, int]) -> tuple[torch.Tensor, ...]:
+        return image, torch.cat([torch.full_like(depth[:, :1], left), depth[:, 1:]], dim=1)
+
+    assert bool(preprocess(raw, max_depth_m=10.0, augment=augment)["emptied"]) is emptied
