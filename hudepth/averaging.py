@@ -17,9 +17,8 @@ class EMA(WeightAveraging):
     """Lightning's weight averaging with a decay that begins low, so that early epochs are not those of the first step.
 
     With each step the average becomes ``d * average + (1 - d) * weights``, d = min(decay, (1 + n) / (10 + n)) after n
-    earlier steps; it begins with the weights of the first. Statistics
-    of batch norm are averaged, too. The average validates and draws, and is what ``best.ckpt`` holds; ``last.ckpt``
-    holds the weights beside it.
+    earlier steps; it begins with the weights of the first. Statistics of batch norm are averaged, too. The average
+    validates and draws, and is what ``best.ckpt`` holds; ``last.ckpt`` holds the weights beside it.
 
     Args:
         decay: in [0, 1); 0.998 averages over some 500 steps.

@@ -23,7 +23,7 @@ from hudepth.errors import CheckpointError
 CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
 KIND = "hudepth-bundle"
 PRETRAINED = ("nyu",)
-"""Models that come with hudepth, by the name that ``checkpoint=`` takes: ``nyu`` was trained by experiment/strong."""
+"""Names that ``checkpoint=`` keeps for models that come with hudepth. The weights of ``nyu`` are not published yet."""
 MAX_CONFIG_BYTES = 1 << 22
 MAX_WEIGHTS_BYTES = 1 << 32
 

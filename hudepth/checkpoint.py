@@ -118,8 +118,8 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     """Return the file that ``spec`` means.
 
     Args:
-        spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or the
-            name of a model that comes with hudepth, one of :data:`hudepth.bundles.PRETRAINED`.
+        spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or
+            one of :data:`hudepth.bundles.PRETRAINED`.
         runs: where ``last`` looks.
 
     Raises:

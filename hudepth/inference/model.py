@@ -123,7 +123,7 @@ def load(
 
     Args:
         spec: a checkpoint, run directory, bundle (folder or zip), exported ``.onnx``, ``.xml`` or ``.pt2`` file, or
-            ``last`` for the newest run, or ``nyu`` for the model that comes along.
+            ``last`` for the newest run.
         backend: ``auto``, or what shall run an exported file: ``onnxruntime``, ``openvino`` or ``torch``.
         device: ``auto`` (a GPU if there is one), ``cpu``, ``cuda`` or ``mps``; checkpoints alone can choose.
         precision: ``float32``, or ``bfloat16`` in OpenVINO, which is faster and not exact.

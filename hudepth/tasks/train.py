@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -185,17 +185,7 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
         datamodule.split = load_split(split_file, datamodule.store.records)
     elif _first_process():
         save_split(split_file, datamodule.split, datamodule.store.records)
-    before: list[dict[str, Any]] = []
-    if resumed is not None:
-        if epochs := sorted({look["epoch"] for look in run_dir.scored(path)}):
-            log.warning(
-                "the test images of this run were looked at after epoch %s: if that is why it goes on, its next test "
-                "flatters it. metrics.json will say so (scored_before)",
-                ", ".join(map(str, epochs)),
-            )
-        before = load_checkpoint(str(path / run_dir.CHECKPOINTS / run_dir.LAST)).data.get(BEFORE, [])
-    elif config.get("init"):
-        before = start_from(net, str(config["init"]), datamodule)
+    before = _seen_before(config, path, net, datamodule, resumed=resumed is not None)
     if config.get("compile"):
         net.compile()  # in place: names of parameters, and so checkpoints, stay as they are
     module = build_module(config, net, datamodule, trust=trust, before=before)
@@ -228,6 +218,22 @@ def _fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None) -> fl
         options = {"accelerator": config["trainer"]["accelerator"]}  # one device and full precision, as hudepth-test
         score_checkpoint(checkpoint, config={**config, "trainer": options}, output=path / "test", datamodule=datamodule)
     return None if score is None else float(score)
+
+
+def _seen_before(
+    config: Mapping[str, Any], path: Path, net: nn.Module, datamodule: DepthDataModule, *, resumed: bool
+) -> list[dict[str, Any]]:
+    """Return what the weights that a run starts from were trained on, and put them into ``net`` if it is a new run."""
+    if not resumed:
+        return start_from(net, str(config["init"]), datamodule) if config.get("init") else []
+    if epochs := sorted({look["epoch"] for look in run_dir.scored(path)}):
+        log.warning(
+            "the test images of this run were looked at after epoch %s: if that is why it goes on, its next test "
+            "flatters it. metrics.json will say so (scored_before)",
+            ", ".join(map(str, epochs)),
+        )
+    before: list[dict[str, Any]] = load_checkpoint(str(path / run_dir.CHECKPOINTS / run_dir.LAST)).data.get(BEFORE, [])
+    return before
 
 
 def start_from(net: nn.Module, spec: str, datamodule: DepthDataModule) -> list[dict[str, Any]]:
