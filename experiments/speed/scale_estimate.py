@@ -55,8 +55,8 @@ def estimate() -> str:
     workers = math.ceil(fast / rates["loader"])
     lines = [
         f"Measured on {CORES} CPU cores: the loader reads {rates['loader']:,.0f} images/s, augmentation, which runs "
-        f"where the network does, changes {rates['augmentation']:,.0f}, training steps take {rates['step']:.1f}. A step "
-        f"is {work:.1f} GFLOP an image (three times the counted forward pass), so these cores compute "
+        f"where the network does, changes {rates['augmentation']:,.0f}, training steps take {rates['step']:.1f}. A "
+        f"step is {work:.1f} GFLOP an image (three times the counted forward pass), so these cores compute "
         f"{rates['step'] * work:.0f} GFLOP/s. Assumed of an H100 with `trainer.precision=bf16-mixed "
         f"memory_format=channels_last`: {100 * SHARES[0]:.0f} to {100 * SHARES[1]:.0f} % of its {PEAK_TFLOPS} TFLOP/s, "
         f"which is {_round(slow)} to {_round(fast)} images/s, and that eight reach {100 * SCALING:.0f} % of eight "

@@ -27,10 +27,14 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
         progressive: mappings of ``size`` and ``until``, in order.
         size: (height, width) of the images in the store, which is that of what comes after the last stage.
 
+    Returns:
+        The stages with smaller images than the store's: a plan that was made for larger ones may be given, too.
+
     Raises:
-        ConfigError: if it is no such list, its shares do not rise within (0, 1), or a size exceeds the store's.
+        ConfigError: if it is no such list, its shares do not rise within (0, 1), or one side alone exceeds the store's.
     """
     stages: list[Stage] = []
+    before = 0.0
     for number, entry in enumerate(progressive):
         key = f"data.progressive[{number}]"
         try:
@@ -40,12 +44,14 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
             raise ConfigError(
                 f"{key}: {entry!r} is no stage. Pass data.progressive=[{{size:[112,112],until:0.5}}], for example."
             ) from error
-        before = stages[-1].until if stages else 0.0
         if not before < stage.until < 1:
             raise ConfigError(
                 f"{key}.until: {stage.until:g} is not a share of the epochs between {before:g} and 1, where this "
                 "stage ends; shares rise from stage to stage, and the last part is at data.size."
             )
+        before = stage.until
+        if height >= size[0] and width >= size[1]:
+            continue
         if height > size[0] or width > size[1] or min(height, width) < 1:
             raise ConfigError(
                 f"{key}.size: [{height},{width}] is not within data.size=[{size[0]},{size[1]}], which the images "

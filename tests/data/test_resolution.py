@@ -19,8 +19,8 @@ TWO = [Stage((112, 112), 0.5), Stage((160, 160), 0.8)]
 
 
 def test_stages_are_read_in_order() -> None:
-    plan: list[Mapping[str, Any]] = [{"size": [112, 144], "until": 0.5}, {"size": (224, 288), "until": "0.8"}]
-    assert read_stages(plan, size=SIZE) == [Stage((112, 144), 0.5), Stage((224, 288), 0.8)]
+    plan: list[Mapping[str, Any]] = [{"size": [112, 144], "until": 0.5}, {"size": (160, 288), "until": "0.8"}]
+    assert read_stages(plan, size=SIZE) == [Stage((112, 144), 0.5), Stage((160, 288), 0.8)]
     assert read_stages([], size=SIZE) == []
 
 
@@ -119,7 +119,15 @@ def test_a_share_out_of_order(before: list[float], until: float) -> None:
     )
 
 
-@pytest.mark.parametrize("size", [[225, 224], [224, 289], [0, 112], [112, -16]])
+@pytest.mark.parametrize("size", [SIZE, (240, 320)])
+def test_a_stage_that_is_not_smaller_is_left_out(size: tuple[int, int]) -> None:
+    plan = [{"size": [112, 144], "until": 0.3}, {"size": size, "until": 0.6}]
+    assert read_stages(plan, size=SIZE) == [Stage((112, 144), 0.3)]
+    with pytest.raises(ConfigError, match=r"between 0\.6 and 1"):
+        read_stages([*plan, {"size": [128, 160], "until": 0.5}], size=SIZE)
+
+
+@pytest.mark.parametrize("size", [[225, 224], [208, 289], [0, 112], [112, -16]])
 def test_a_size_beyond_the_stores(size: list[int]) -> None:
     with pytest.raises(ConfigError) as caught:
         read_stages([{"size": size, "until": 0.5}], size=SIZE)

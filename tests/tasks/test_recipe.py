@@ -60,8 +60,8 @@ def test_progressive_resolution_is_in_times_csv_and_only_its_last_part_can_be_be
             "Pass data.progressive[0].size=[16,32] or [32,32].",
         ),
         (
-            "[{size:[16,32],until:0.5},{size:[64,64],until:0.8}]",
-            "data.progressive[1].size: [64,64] is not within data.size=[32,48], which the images are stored at.",
+            "[{size:[16,32],until:0.5},{size:[16,64],until:0.8}]",
+            "data.progressive[1].size: [16,64] is not within data.size=[32,48], which the images are stored at.",
         ),
         (
             "[{size:[16,32],until:1.0}]",
