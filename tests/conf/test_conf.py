@@ -94,15 +94,21 @@ def jobs_of(name: str, *typed: str) -> list[Job]:
         ("architecture", 9),
         ("seeds", 5),
         ("lambda_grid", 27),
-        ("recipe", 22),
+        ("recipe", 24),
     ],
 )
 def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> None:
-    jobs = jobs_of(name)
+    jobs = jobs_of(name, *(["init=pretrained"] if name == "recipe" else []))
     assert [job.error for job in jobs] == [""] * count
     assert len({job.folder for job in jobs}) == count
     text = (CONF / "sweep" / f"{name}.yaml").read_text()
     assert f"{count} runs" in text
+
+
+def test_the_recipe_without_pretraining_is_the_recipe_where_there_is_none() -> None:
+    labels = [job.labels["variant"] for job in jobs_of("recipe", "seed=1")]
+    assert len(labels) == 11
+    assert "no_pretraining" not in labels
 
 
 def test_the_subsets_of_badcls_terms_are_all_seven() -> None:
