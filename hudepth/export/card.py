@@ -55,8 +55,8 @@ def model_card(
     """
     source = str(checkpoint.data.get("source", "unknown"))
     sections = (
-        _header(source), f"# {name}", _about(info), _use(info, parity, half=half), _training(checkpoint, source),
-        _results(results), samples, _limits(info, source),
+        _header(source, onnx=not half), f"# {name}", _about(info), _use(info, parity, half=half),
+        _training(checkpoint, source), _results(results), samples, _limits(info, source),
         "## Licence\n\nCode: MIT. Training data: "
         + DATA_LICENCES.get(source, f"'{source}', whose terms whoever publishes this model must state here.")
         + " What that means for the weights is for you to judge.",
@@ -65,8 +65,8 @@ def model_card(
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def _header(source: str) -> str:
-    tags = "\n".join(f"- {tag}" for tag in ("depth-estimation", "monocular-depth", "onnx", "hudepth"))
+def _header(source: str, *, onnx: bool) -> str:
+    tags = "\n".join(f"- {tag}" for tag in ("depth-estimation", "monocular-depth", *["onnx"] * onnx, "hudepth"))
     licence = "mit" if source == "rooms" else "other"
     return f"---\nlibrary_name: hudepth\npipeline_tag: depth-estimation\nlicense: {licence}\ntags:\n{tags}\n---"
 
@@ -104,16 +104,27 @@ def _use(info: ModelInfo, parity: str, *, half: bool) -> str:
 def _training(checkpoint: Checkpoint, source: str) -> str:
     split = checkpoint.split
     counts = ", ".join(f"{count:,} {name}" for name, count in split.get("counts", {}).items())
-    loss = checkpoint.config.get("loss") or {}
+    before = [f"{each.get('source')}, {each.get('pairs')} pairs" for each in checkpoint.data.get("before", [])]
     rows = {
         "data": f"{source}, {checkpoint.data.get('pairs')} pairs, depth encoding {checkpoint.data.get('encoding')}",
         "fingerprint of the data": f"`{checkpoint.data.get('fingerprint')}`",
         "split": f"{split.get('kind')}, seed {split.get('seed')}: {counts}",
         "hash of the split": f"`{split.get('sha256')}`",
         "epochs": str(checkpoint.epoch),
-        "loss": str(loss.get("_target_", "unknown")).rpartition(".")[2],
+        "loss": _loss(checkpoint.config.get("loss") or {}),
+        **({"trained before on": "; ".join(before)} if before else {}),
     }
     return "## Training\n\n| | |\n|---|---|\n" + "\n".join(f"| {key} | {value} |" for key, value in rows.items())
+
+
+def _loss(loss: Mapping[str, Any]) -> str:
+    """Name a loss, or those that it mixes."""
+    names = [f"{weight:g} {_class(loss['losses'][part])}" for part, weight in loss.get("weights", {}).items() if weight]
+    return " + ".join(names) or _class(loss)
+
+
+def _class(config: Mapping[str, Any]) -> str:
+    return str(config.get("_target_", "unknown")).rpartition(".")[2]
 
 
 def _results(results: Mapping[str, Mapping[str, Any]]) -> str:

@@ -322,6 +322,28 @@ def test_a_card_of_an_untested_model_says_so(trained: Path) -> None:
     assert "None are on record. `hudepth-test` makes some" in card
 
 
+def test_a_card_names_what_came_before_and_each_loss_of_a_mixture(trained: Path) -> None:
+    checkpoint = load_checkpoint(str(trained))
+    checkpoint = replace(
+        checkpoint,
+        data={**checkpoint.data, "before": [{"source": "rooms", "pairs": 8000}]},
+        config={
+            **checkpoint.config,
+            "loss": {
+                "_target_": "hudepth.losses.mixture.Mixture",
+                "losses": {name: {"_target_": f"hudepth.losses.{name}"} for name in ("SILog", "BADCL", "BerHu")},
+                "weights": {"SILog": 1.0, "BADCL": 0.3, "BerHu": 0},
+            },
+        },
+    )
+    card = model_card(
+        checkpoint, info_of(checkpoint, parameters=1), name="x", results={}, parity="", samples="", half=True
+    )
+    assert "| trained before on | rooms, 8000 pairs |" in card
+    assert "| loss | 1 SILog + 0.3 BADCL |" in card
+    assert "- onnx" not in card
+
+
 def test_a_bundle_of_half_the_size(command: Command, trained: Path, tmp_path: Path) -> None:
     for name, half in (("whole", "false"), ("small", "true")):
         done = command("export", f"checkpoint={trained}", "format=bundle", f"name={name}", f"half={half}", "compared=4")
