@@ -94,7 +94,7 @@ def jobs_of(name: str, *typed: str) -> list[Job]:
         ("architecture", 9),
         ("seeds", 5),
         ("lambda_grid", 27),
-        ("recipe", 24),
+        ("recipe", 26),
     ],
 )
 def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> None:
@@ -107,7 +107,7 @@ def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> No
 
 def test_the_recipe_without_pretraining_is_the_recipe_where_there_is_none() -> None:
     labels = [job.labels["variant"] for job in jobs_of("recipe", "seed=1")]
-    assert len(labels) == 11
+    assert len(labels) == 12
     assert "no_pretraining" not in labels
 
 
