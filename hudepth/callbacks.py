@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import nn
 
@@ -229,6 +229,21 @@ def evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
     return [indices[i * len(indices) // count] for i in range(count)]
 
 
+def at_full_size(trainer: Trainer) -> bool:
+    """Tell whether the network trains at the size it will be used at, and not at a smaller one to begin with."""
+    data = getattr(trainer, "datamodule", None)
+    return data is None or bool(data.train_size == data.size)
+
+
+class FullSizeEarlyStopping(EarlyStopping):
+    """An EarlyStopping that counts the epochs at full size only."""
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Count, and stop if it is time."""
+        if at_full_size(trainer):
+            super().on_train_epoch_end(trainer, pl_module)
+
+
 class KeptCheckpoint(ModelCheckpoint):
     """A ModelCheckpoint that still knows the best so far when the run directory was moved before it went on.
 
@@ -237,8 +252,7 @@ class KeptCheckpoint(ModelCheckpoint):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save, if it is time."""
-        data = getattr(trainer, "datamodule", None)
-        if self.monitor is None or data is None or data.train_size == data.size:
+        if self.monitor is None or at_full_size(trainer):
             super().on_train_epoch_end(trainer, pl_module)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

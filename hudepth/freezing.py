@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -36,12 +37,28 @@ class FreezeTrunk(Callback):
             )
         self.until, self.stages = until, tuple(stages)
 
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Freeze, or let go."""
-        trunk = getattr(getattr(pl_module, "net", None), "trunk", None)
-        if trunk is None:
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Freeze before a strategy looks for what it has to share among processes."""
+        if stage != "fit":
+            return
+        if getattr(getattr(pl_module, "net", None), "trunk", None) is None:
             raise ConfigError("FreezeTrunk: this network has no trunk. Leave it out of callbacks.extra.")
-        frozen = trainer.current_epoch < round(self.until * (trainer.max_epochs or 0))
+        if self.until < 1 and trainer.world_size > 1:
+            raise ConfigError(
+                "FreezeTrunk.until: several processes would not share what is let go later. Pass until=1, or "
+                "trainer.devices=1."
+            )
+        if self.until < 1 and (trainer.max_epochs or -1) < 0:
+            raise ConfigError("FreezeTrunk.until: a share of the epochs needs trainer.max_epochs. Pass it, or until=1.")
+        self._freeze(pl_module, frozen=True)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Let go, if it is time."""
+        if self.until < 1:
+            self._freeze(pl_module, frozen=trainer.current_epoch < round(self.until * (trainer.max_epochs or 0)))
+
+    def _freeze(self, pl_module: LightningModule, *, frozen: bool) -> None:
+        net: Any = pl_module.net
         names = [name for stage in self.stages for name in (("conv1", "bn1") if stage == "stem" else (stage,))]
         for name in names:
-            getattr(trunk, name).requires_grad_(requires_grad=not frozen)
+            getattr(net.trunk, name).requires_grad_(requires_grad=not frozen)

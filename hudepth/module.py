@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from torchmetrics import MetricCollection
 
 from hudepth import checkpoint as ckpt
 from hudepth.averaging import averaged_state
-from hudepth.errors import TrainingError
+from hudepth.errors import ConfigError, TrainingError
 from hudepth.losses.distillation import Distillation
 from hudepth.metrics.collection import DepthMetrics, DepthSSIM
 from hudepth.metrics.depth import METRIC_NAMES
@@ -78,6 +79,7 @@ class DepthModule(LightningModule):
         self._make_optimizer, self._make_scheduler = optimizer, scheduler
         self._record = record or {}
         self._unchecked: deque[_Step] = deque()
+        self._emptied: list[_Step] = []  # in this epoch
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Predict unit depth from normalised images."""
@@ -135,6 +137,7 @@ class DepthModule(LightningModule):
     def on_train_epoch_end(self) -> None:
         """Check the losses that were not looked at yet, and what the last step left, before anything is saved."""
         self._check_pending()
+        self._check_emptied()
         finite = torch.stack([parameter.detach().isfinite().all() for parameter in self.net.parameters()]).all()
         if not bool(finite):
             raise TrainingError(
@@ -149,20 +152,30 @@ class DepthModule(LightningModule):
         bad = [~step.total.isfinite() | step.emptied for step in pending]
         if not bad or not bool(torch.stack(bad).any()):
             return
-        first = next(step for step, is_bad in zip(pending, bad, strict=True) if bool(is_bad))
-        store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
-        names = ", ".join(store.records[i].id if store else str(i) for i in first.rows.tolist())
-        number = self.current_epoch * int(self.trainer.num_training_batches) + first.batch_idx + 1
-        where = f"in epoch {self.current_epoch + 1}, batch {first.batch_idx} (step {number}), of the pairs {names}"
-        if bool(first.emptied):
+        for step in pending:
+            if not bool(step.total.isfinite()):
+                raise TrainingError(
+                    f"the loss is {step.total.item()} {self._where(step)}. {self._last_good()} "
+                    "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
+                )
+        self._emptied += [step for step in pending if bool(step.emptied)]
+
+    def _check_emptied(self) -> None:
+        """Stop if augmentation leaves most batches without truth; one of few measured pixels may lose them."""
+        emptied, batches = self._emptied, int(self.trainer.num_training_batches)
+        self._emptied = []
+        if 2 * len(emptied) > batches:
             raise TrainingError(
-                f"augmentation left no measured pixel {where}. Lower augment.zoom, augment.rotate_deg or "
-                "augment.border, or raise data.batch_size."
+                f"augmentation left no measured pixel in {len(emptied)} of {batches} batches, first "
+                f"{self._where(emptied[0])}. Lower augment.zoom, augment.rotate_deg or augment.border, or raise "
+                "data.batch_size."
             )
-        raise TrainingError(
-            f"the loss is {first.total.item()} {where}. {self._last_good()} "
-            "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
-        )
+
+    def _where(self, step: _Step) -> str:
+        store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
+        names = ", ".join(store.records[i].id if store else str(i) for i in step.rows.tolist())
+        number = self.current_epoch * int(self.trainer.num_training_batches) + step.batch_idx + 1
+        return f"in epoch {self.current_epoch + 1}, batch {step.batch_idx} (step {number}), of the pairs {names}"
 
     def _last_good(self) -> str:
         """Tell where the last checkpoint is: it was written before anything became NaN."""
@@ -176,9 +189,21 @@ class DepthModule(LightningModule):
         optimizer = self._make_optimizer(self.net.named_parameters())
         if self._make_scheduler is None:
             return optimizer
-        scheduler = self._make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+        steps = self.trainer.estimated_stepping_batches  # infinite if nothing says how long the training is
+        scheduler = self._make_scheduler(optimizer, int(steps) if math.isfinite(steps) else 0)
         interval = "step" if isinstance(scheduler, StepSchedule) else "epoch"
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
+
+    def on_train_start(self) -> None:
+        """Refuse to go on with a schedule that was laid out over another number of steps."""
+        scheduler = self.lr_schedulers() if self._make_scheduler else None
+        steps = self.trainer.estimated_stepping_batches
+        if isinstance(scheduler, StepSchedule) and scheduler.total_steps != steps:
+            raise ConfigError(
+                f"resume: the learning-rate schedule of this run is laid out over {scheduler.total_steps} steps, and "
+                f"now there would be {steps:g}. Leave trainer.accumulate_grad_batches, trainer.limit_train_batches and "
+                "the number of devices as they were, or start a new run."
+            )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the configuration and the split, so that a checkpoint needs nothing beside it.

@@ -21,12 +21,17 @@ class StepSchedule(LambdaLR):
         warmup: share of the training in which the factor rises evenly from 0 to 1, in [0, 1).
 
     Raises:
-        ConfigError: if ``warmup`` is out of range.
+        ConfigError: if ``warmup`` is out of range, or the training has no end.
     """
 
     def __init__(self, optimizer: Optimizer, *, total_steps: int, warmup: float = 0.0) -> None:
         if not 0 <= warmup < 1:
             raise ConfigError(f"schedule.warmup: {warmup} is not a share of the training, in [0, 1).")
+        if total_steps < 1:
+            raise ConfigError(
+                "schedule: one that ends with the training must know how long that is. Pass trainer.max_epochs or "
+                "+trainer.max_steps, or schedule=constant."
+            )
         self.total_steps, self.warmup = total_steps, warmup
         super().__init__(optimizer, partial(self._factor))
 

@@ -121,6 +121,23 @@ def test_frozen_statistics_and_frozen_stages_leave_nothing_to_change(cache: Path
     assert "trunk.layer2.0.conv1.weight" not in same
 
 
+def test_a_share_of_an_endless_training(cache: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        fit(cache, FreezeTrunk(until=0.3), Net(), epochs=-1)
+    assert str(caught.value) == (
+        "FreezeTrunk.until: a share of the epochs needs trainer.max_epochs. Pass it, or until=1."
+    )
+
+
+def test_several_processes_share_only_what_they_knew_from_the_start() -> None:
+    module = DepthModule(Net(), L1(), max_depth_m=10.0, optimizer=partial(torch.optim.AdamW, lr=1e-3))
+    trainer = Trainer(accelerator="cpu", devices=2, logger=False, enable_checkpointing=False, strategy="ddp")
+    with pytest.raises(ConfigError, match=r"^FreezeTrunk\.until: several processes would not share"):
+        FreezeTrunk(until=0.5).setup(trainer, module, "fit")
+    FreezeTrunk(until=1, stages=STAGES).setup(trainer, module, "fit")  # before the strategy wraps the module
+    assert not any(parameter.requires_grad for parameter in module.net.trunk.parameters())  # type: ignore[union-attr]
+
+
 def test_a_network_without_a_trunk(cache: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         fit(cache, FreezeTrunk(), TinyUNet(), epochs=1)

@@ -65,7 +65,7 @@ def test_defaults_begin_low_and_end_at_a_hundredth() -> None:
     assert rates[-1] == pytest.approx(0.01)
 
 
-@given(total=st.integers(0, 60), warmup=st.floats(0, 0.99), final=st.floats(0, 1))
+@given(total=st.integers(1, 60), warmup=st.floats(0, 0.99), final=st.floats(0, 1))
 def test_rates_rise_then_fall_and_stay_at_the_end(total: int, warmup: float, final: float) -> None:
     schedule = WarmupCosine(optimizer(1.0), total_steps=total, warmup=warmup, final=final)
     rates = rates_of(schedule, total + 5)

@@ -74,8 +74,8 @@ def warp(
     image = _at_most_twice(image, size)
     inside = grid
     if geometry.border:  # neither a rolled corner nor linear interpolation may reach what was cut off
-        reach = kept - 1 / torch.tensor(image.shape[:-3:-1], device=grid.device)
-        inside = grid.clamp(-reach, reach)
+        reaches = [kept - 1 / side for side in image.shape[:-3:-1]]
+        inside = torch.stack([grid[..., i].clamp(-reach, reach) for i, reach in enumerate(reaches)], dim=-1)
     image = functional.grid_sample(image, inside, mode="bilinear", padding_mode="border", align_corners=False)
     depth = functional.grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)
     if geometry.border:
@@ -133,10 +133,12 @@ def change_colours(
     """
     image = image.clamp(1e-4, 1) ** gamma[:, None, None, None]
     # What follows is linear in the colours of a pixel: one matrix and one offset for each image.
-    weights = torch.tensor(BT601_LUMA, dtype=image.dtype, device=image.device)
+    # Constants are made where they are used: to copy them there, a GPU would have to be waited for.
+    weights = torch.stack([torch.full_like(gamma[0], weight) for weight in BT601_LUMA])
+    eye = torch.eye(3, dtype=image.dtype, device=image.device)
     scale = brightness[:, None] * tint
     mean = (scale * image.mean(dim=(2, 3))) @ weights
-    saturate = torch.lerp(weights.expand(3, 3), torch.eye(3).to(image), saturation[:, None, None])
+    saturate = torch.lerp(weights.expand(3, 3), eye, saturation[:, None, None])
     matrix = saturate * (contrast[:, None] * scale)[:, None, :]
     offset = ((1 - contrast) * mean)[:, None, None].expand(-1, 3, 1)
     return torch.baddbmm(offset, matrix, image.flatten(2)).reshape(image.shape).clamp_(0, 1)

@@ -157,8 +157,9 @@ class DepthDataModule(LightningDataModule):
         )
         if self.shuffle_block:
             sampler = BlockShuffle(
-                dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size
-            )
+                dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
+                read_ahead=self.store.read_ahead,
+            )  # fmt: skip
         return self._loader(dataset, sampler)
 
     def val_dataloader(self) -> DataLoader[RawBatch]:

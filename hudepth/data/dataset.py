@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,13 +94,16 @@ class BlockShuffle(Sampler[int]):
         rank: of this process.
         world_size: number of processes.
         group: blocks whose pairs are mixed; that many lie in memory at once.
+        read_ahead: told (first row, last row) of each block before its pairs are asked for.
     """
 
     def __init__(
-        self, rows: Sequence[int], *, block: int, seed: int, rank: int = 0, world_size: int = 1, group: int = 16
-    ) -> None:
+        self, rows: Sequence[int], *, block: int, seed: int, rank: int = 0, world_size: int = 1, group: int = 16,
+        read_ahead: Callable[[int, int], None] | None = None,
+    ) -> None:  # fmt: skip
         self.rows = np.asarray(rows)
         self.block, self.seed, self.rank, self.world_size, self.group = block, seed, rank, world_size, group
+        self.read_ahead = read_ahead
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -115,7 +118,13 @@ class BlockShuffle(Sampler[int]):
         sorted_positions = np.argsort(self.rows, kind="stable")
         blocks = [sorted_positions[i : i + self.block] for i in range(0, len(self.rows), self.block)]
         blocks = [blocks[i] for i in random.permutation(len(blocks))]
-        groups = [np.concatenate(blocks[i : i + self.group]) for i in range(0, len(blocks), self.group)]
-        order = np.concatenate([random.permutation(group) for group in groups])
-        order = np.resize(order, len(self) * self.world_size)
-        return iter(order[self.rank :: self.world_size].tolist())
+        groups = [blocks[i : i + self.group] for i in range(0, len(blocks), self.group)]
+        orders = [random.permutation(np.concatenate(group)) for group in groups]
+        starts = dict(zip(np.cumsum([0, *map(len, orders)]).tolist(), groups, strict=False))
+        order = np.resize(np.concatenate(orders), len(self) * self.world_size).tolist()
+        for place, position in enumerate(order):
+            if self.read_ahead and place in starts:
+                for block in starts[place]:
+                    self.read_ahead(int(self.rows[block[0]]), int(self.rows[block[-1]]))
+            if place % self.world_size == self.rank:
+                yield position

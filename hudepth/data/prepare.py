@@ -21,6 +21,8 @@ from hudepth.data.store import VERSION, DepthStore, StoreWriter
 from hudepth.errors import ConfigError, DataError
 from hudepth.files import written_whole
 
+MAX_SIZES = 16
+"""Sizes of images that a store names, of a set that has many."""
 UNIT_SAMPLES = 16
 """Pairs whose depth is checked for plausible units before the others are read."""
 
@@ -170,7 +172,7 @@ def _info(source: Source, pairs: Sequence[PreparedPair], skipped: list[str]) -> 
         "depth_median_m": round(float(np.median(ranges[:, 1])), 3),
         "depth_max_m": round(float(ranges[:, 2].max()), 3),
         "valid_fraction": round(float(np.mean([pair.valid_fraction for pair in pairs])), 4),
-        "native_sizes": sorted({pair.native_size for pair in pairs})[:16],
+        "native_sizes": sorted({pair.native_size for pair in pairs})[:MAX_SIZES],
         "skipped": skipped,
     }
 

@@ -28,10 +28,10 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
         size: (height, width) of the images in the store, which is that of what comes after the last stage.
 
     Returns:
-        The stages with smaller images than the store's: a plan that was made for larger ones may be given, too.
+        The stages whose images are smaller than the store's: a plan that was made for larger ones may be given, too.
 
     Raises:
-        ConfigError: if it is no such list, its shares do not rise within (0, 1), or one side alone exceeds the store's.
+        ConfigError: if it is no such list, or its shares do not rise within (0, 1).
     """
     stages: list[Stage] = []
     before = 0.0
@@ -50,14 +50,10 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
                 "stage ends; shares rise from stage to stage, and the last part is at data.size."
             )
         before = stage.until
-        if height >= size[0] and width >= size[1]:
-            continue
-        if height > size[0] or width > size[1] or min(height, width) < 1:
-            raise ConfigError(
-                f"{key}.size: [{height},{width}] is not within data.size=[{size[0]},{size[1]}], which the images "
-                "are stored at."
-            )
-        stages.append(stage)
+        if min(height, width) < 1:
+            raise ConfigError(f"{key}.size: [{height},{width}] is no size of an image. Pass multiples of 16.")
+        if height <= size[0] and width <= size[1] and stage.size != size:
+            stages.append(stage)
     return stages
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -206,6 +207,25 @@ class DepthStore:
             source_image.read_direct(images, np.s_[index], np.s_[row])
             source_depth.read_direct(depths, np.s_[index], np.s_[row])
         return images, depths
+
+    def read_ahead(self, first: int, last: int) -> None:
+        """Ask the system to read neighbouring pairs from the disk in one go; a hint, and nothing where it takes none.
+
+        Args:
+            first: position of the first pair.
+            last: position of the last one.
+        """
+        if not hasattr(os, "posix_fadvise"):
+            return
+        file = self._handle.get(self.path)
+        with self.path.open("rb") as raw:
+            for name in ("image", "depth_mm"):
+                data = file[name]
+                start, row = data.id.get_offset(), data.dtype.itemsize * math.prod(data.shape[1:])
+                if start is not None:  # else not in one piece
+                    os.posix_fadvise(
+                        raw.fileno(), start + first * row, (last - first + 1) * row, os.POSIX_FADV_WILLNEED
+                    )
 
     def read_native(self, index: int) -> NDArray[np.float32]:
         """Read one truth at its native resolution: [H, W] metres, 0 where unmeasured.

@@ -14,6 +14,7 @@ from filelock import FileLock
 from numpy.typing import NDArray
 
 from hudepth.console import track
+from hudepth.data.prepare import MAX_SIZES
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess, read_depth
 from hudepth.data.store import DepthStore
@@ -100,7 +101,7 @@ def _prepare(files: Sequence[Path], records: Sequence[Record], store: DepthStore
             depths = out.create_dataset("depth", (len(files), height, width), "f4", chunks=(1, height, width))
             for row, file in enumerate(track(files, total=len(files), what="reading the teacher's depths")):
                 depth = _read(file)
-                if depth.shape not in native:
+                if depth.shape not in native and len(native) < MAX_SIZES:  # else the store names some of them only
                     sizes = " or ".join(f"{h} x {w}" for h, w in sorted(native, reverse=True)[:3])
                     raise DataError(
                         f"distill.teacher: '{file}' is {depth.shape[0]} x {depth.shape[1]}, but the images are {sizes} "

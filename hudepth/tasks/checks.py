@@ -33,6 +33,8 @@ def check_config(config: dict[str, Any]) -> None:
         )
     if not isinstance(config.get("compile", False), bool):
         raise ConfigError(f"compile: {config['compile']!r} is neither true nor false.")
+    if config.get("compile") and config["model"].get("recompute"):
+        raise ConfigError("compile: torch.compile cannot compile model.recompute. Leave one of them false.")
     name = config["name"]
     if name is None or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", str(name)) or ".." in str(name).split("/"):
         raise ConfigError(f"name: {name!r} cannot name a folder of runs. Use letters, digits, '.', '_' and '-'.")

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hudepth import run_dir
 from hudepth.checkpoint import Checkpoint
+from hudepth.console import log
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import Split, load_split, make_split
-from hudepth.errors import DataError
+from hudepth.errors import CheckpointError, DataError
+from hudepth.metrics.protocol import Protocol
 
 BEFORE = "before"
 """Key of a checkpoint's ``data``: what the network that it started from was trained on, oldest last."""
 
 
 def lineage(checkpoint: Checkpoint) -> list[dict[str, Any]]:
-    """Return what a checkpoint was trained on, then what it had started from: data, split and, if known, split.json."""
+    """Return what a checkpoint was trained on, then what it had started from: data, split and, if known, split.json.
+
+    Raises:
+        CheckpointError: if it says so in no form that we know.
+    """
     own = {key: value for key, value in checkpoint.data.items() if key != BEFORE}
-    return [{**own, "split": checkpoint.split}, *checkpoint.data.get(BEFORE, [])]
+    before = checkpoint.data.get(BEFORE, [])
+    if not isinstance(before, list) or not all(isinstance(past, dict) for past in before):
+        raise CheckpointError(f"'{checkpoint.path}' is damaged: it does not say what it was trained on.")
+    return [{**own, "split": checkpoint.split}, *before]
 
 
 def recorded_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | None:
@@ -38,11 +49,14 @@ def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *
     """
     for number, past in enumerate(lineage(checkpoint)):
         if past.get("fingerprint") != datamodule.store.info["fingerprint"]:
+            if past.get("source") == datamodule.source.name:
+                log.warning(
+                    "'%s' was trained on another set of %s, or on other files of this one: if some of its pairs are "
+                    "among those that judge it now, nobody can tell",
+                    checkpoint.path, past["source"],
+                )  # fmt: skip
             continue
-        split = past["split"]
-        trained = (recorded_split(checkpoint, datamodule) if number == 0 else None) or make_split(
-            datamodule.store.records, kind=split["kind"], seed=split["seed"], fractions=split["fractions"]
-        )
+        trained = (recorded_split(checkpoint, datamodule) if number == 0 else None) or _split_again(past, datamodule)
         for subset in subsets:
             shared = set(trained.train) & set(datamodule.split[subset])
             if shared:
@@ -56,3 +70,38 @@ def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *
                         else "Pass the same data.split, or init=null."
                     )
                 )
+
+
+def _split_again(past: Mapping[str, Any], datamodule: DepthDataModule) -> Split:
+    """Make the split of a training again, as its checkpoint describes it."""
+    try:
+        split = past["split"]
+        kind, seed, fractions = str(split["kind"]), int(split["seed"]), [float(share) for share in split["fractions"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            "checkpoint, init: a training on this very data is named without its split, so what was trained on cannot "
+            "be told. Pass another checkpoint, or init=null."
+        ) from error
+    return make_split(datamodule.store.records, kind=kind, seed=seed, fractions=fractions)
+
+
+def note_scored(checkpoint: Checkpoint, datamodule: DepthDataModule, protocols: Sequence[Protocol]) -> list[int] | None:
+    """Note in the run that its test images are looked at.
+
+    Returns:
+        The other epochs that were scored on them before. None: this cannot be told, since the file was moved away from
+        its run, or nothing can be written there.
+    """
+    if checkpoint.run is None:
+        return None
+    try:
+        return run_dir.note_scored(
+            checkpoint.run,
+            epoch=checkpoint.epoch,
+            data=datamodule.source.name,
+            split=datamodule.split.sha256,
+            protocols=[protocol.name for protocol in protocols],
+        )
+    except OSError as error:
+        log.warning("'%s' cannot note that its test images were looked at (%s)", checkpoint.run, error.strerror)
+        return None

@@ -14,8 +14,8 @@ from hudepth.errors import CheckpointError, ConfigError
 from hudepth.tasks.config import plain
 
 CHANGEABLE = (
-    "trainer.", "callbacks.", "logger.", "data.root", "data.num_workers", "data.prepare_workers", "paths.",
-    "test", "trust",
+    "trainer.", "callbacks.", "logger.", "data.root", "data.num_workers", "data.prepare_workers", "distill.teacher",
+    "paths.", "test", "trust",
 )  # fmt: skip
 """What may differ when a run goes on. All else is in its checkpoint or its split and would only seem to change."""
 

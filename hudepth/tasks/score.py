@@ -11,7 +11,6 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 from torch import nn
 
-from hudepth import run_dir
 from hudepth.baselines import trivial_baselines
 from hudepth.callbacks import evenly_spaced, make_panels
 from hudepth.checkpoint import Checkpoint
@@ -30,6 +29,7 @@ from hudepth.results import MODEL
 from hudepth.tasks.common import build_protocols, without_known_warnings
 from hudepth.tasks.config import whole_number
 from hudepth.tasks.devices import build_trainer, check_shares
+from hudepth.tasks.lineage import note_scored
 from hudepth.tasks.tables import print_results
 from hudepth.viz.panels import save_panels
 from hudepth.viz.strata import save_strata
@@ -71,14 +71,7 @@ def score_checkpoint(
     if not trainer.is_global_zero:
         return {}
     shared = _stamp(checkpoint, datamodule)
-    # None: a file that was moved away from its run knows nothing of earlier looks at the test images
-    shared["checkpoint"]["scored_before"] = checkpoint.run and run_dir.note_scored(
-        checkpoint.run,
-        epoch=checkpoint.epoch,
-        data=datamodule.source.name,
-        split=datamodule.split.sha256,
-        protocols=[protocol.name for protocol in protocols],
-    )
+    shared["checkpoint"]["scored_before"] = note_scored(checkpoint, datamodule, protocols)
     results, failed = {}, []
     for protocol in protocols:
         try:

@@ -225,7 +225,7 @@ def _seen_before(
 ) -> list[dict[str, Any]]:
     """Return what the weights that a run starts from were trained on, and put them into ``net`` if it is a new run."""
     if not resumed:
-        return start_from(net, str(config["init"]), datamodule) if config.get("init") else []
+        return start_from(net, config, datamodule) if config.get("init") else []
     if epochs := sorted({look["epoch"] for look in run_dir.scored(path)}):
         log.warning(
             "the test images of this run were looked at after epoch %s: if that is why it goes on, its next test "
@@ -236,12 +236,12 @@ def _seen_before(
     return before
 
 
-def start_from(net: nn.Module, spec: str, datamodule: DepthDataModule) -> list[dict[str, Any]]:
+def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataModule) -> list[dict[str, Any]]:
     """Give a network the weights of a checkpoint to begin with.
 
     Args:
         net: to be filled.
-        spec: a run, a checkpoint or a bundle, as for ``checkpoint=`` of the other verbs.
+        config: with ``init``, a run, a checkpoint or a bundle as for ``checkpoint=`` of the other verbs, and ``paths``.
         datamodule: of the training to come.
 
     Returns:
@@ -251,7 +251,7 @@ def start_from(net: nn.Module, spec: str, datamodule: DepthDataModule) -> list[d
         CheckpointError: if there is no such checkpoint, or it is of another network.
         DataError: if it was trained on pairs that are to judge the network now.
     """
-    checkpoint = load_checkpoint(spec)
+    checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"])
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))
     checkpoint.fill(net)
     log.info("init: weights of '%s', epoch %d", checkpoint.path, checkpoint.epoch)

@@ -9,11 +9,12 @@ from typing import Any
 
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.callbacks import EarlyStopping, RichProgressBar
+from lightning.pytorch.callbacks import RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
 from hudepth.callbacks import (
     EpochLine,
+    FullSizeEarlyStopping,
     History,
     Interrupt,
     PanelPictures,
@@ -65,7 +66,9 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
     if trial := os.environ.get(TRIAL_ENV):
         callbacks.append(TrialPruner(trial, monitor=monitor))
     if options["early_stopping"]:
-        callbacks.append(EarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"]))
+        callbacks.append(
+            FullSizeEarlyStopping(monitor, mode=mode, check_on_train_epoch_end=True, **options["early_stopping"])
+        )
     callbacks += [instantiate(extra, trust=config["trust"], only=Callback) for extra in options["extra"]]
     return [*callbacks, *checkpoint_callbacks(path, monitor=monitor, mode=mode)]
 

@@ -120,3 +120,24 @@ def test_block_shuffle_reads_in_pieces_and_anew_each_epoch() -> None:
     assert first == [rows[position] for position in sampler]
     sampler.set_epoch(1)
     assert first != [rows[position] for position in sampler]
+
+
+def test_block_shuffle_tells_what_it_will_ask_for() -> None:
+    told: list[tuple[int, int]] = []
+    sampler = BlockShuffle(
+        range(100), block=10, seed=1, group=3, world_size=2, rank=1, read_ahead=lambda *each: told.append(each)
+    )
+    seen = 0
+    for position in sampler:
+        assert any(first <= position <= last for first, last in told)
+        seen += 1
+    assert seen == 50
+    assert sorted(told) == [(start, start + 9) for start in range(0, 100, 10)]
+    assert next(iter(sampler)) >= 0
+    assert len(told) == 13  # three blocks more, and no more than three
+
+
+def test_a_store_takes_hints(store: DepthStore) -> None:
+    before = store.read([0, 1])
+    store.read_ahead(0, len(store) - 1)
+    assert all((a == b).all() for a, b in zip(before, store.read([0, 1]), strict=True))

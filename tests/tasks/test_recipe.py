@@ -60,10 +60,6 @@ def test_progressive_resolution_is_in_times_csv_and_only_its_last_part_can_be_be
             "Pass data.progressive[0].size=[16,32] or [32,32].",
         ),
         (
-            "[{size:[16,32],until:0.5},{size:[16,64],until:0.8}]",
-            "data.progressive[1].size: [16,64] is not within data.size=[32,48], which the images are stored at.",
-        ),
-        (
             "[{size:[16,32],until:1.0}]",
             "data.progressive[0].until: 1 is not a share of the epochs between 0 and 1, where this stage ends; shares "
             "rise from stage to stage, and the last part is at data.size.",
@@ -123,9 +119,68 @@ def test_augmentation_that_leaves_nothing_stops_with_the_pairs(
     assert done.code == 1
     line = last_line(done.err)
     assert line.startswith(
-        "hudepth-train: augmentation left no measured pixel in epoch 1, batch 0 (step 1), of the pairs room_"
+        "hudepth-train: augmentation left no measured pixel in 4 of 4 batches, first in epoch 1, batch 0 (step 1), of "
+        "the pairs room_"
     )
     assert line.endswith("Lower augment.zoom, augment.rotate_deg or augment.border, or raise data.batch_size.")
+
+    calls: list[int] = []
+
+    def now_and_then(image: torch.Tensor, depth: torch.Tensor, *_: Any, **__: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        calls.append(len(calls))
+        return image, torch.zeros_like(depth) if len(calls) % 4 == 0 else depth
+
+    monkeypatch.setattr(augment, "warp", now_and_then)
+    done = command("train", *QUIET, "augment=flip", "test=false", "loss=mixture", "name=some")
+    assert done.code == 0, done.err
+    assert len(calls) == 8
+
+
+@pytest.mark.parametrize("schedule", ["step", "warmup_cosine"])
+def test_a_training_without_a_number_of_epochs(schedule: str, command: Command) -> None:
+    done = command(
+        "train", *QUIET, f"schedule={schedule}", "trainer.max_epochs=-1", "+trainer.max_steps=3", "test=false"
+    )
+    assert done.code == 0, done.err
+    endless = ("trainer.max_epochs=-1", "+trainer.max_time={seconds:2}")
+    done = command("train", *QUIET, f"schedule={schedule}", *endless, "test=false", "name=endless")
+    if schedule == "step":
+        assert done.code == 0, done.err
+        return
+    assert last_line(done.err) == (
+        "hudepth-train: schedule: one that ends with the training must know how long that is. Pass trainer.max_epochs "
+        "or +trainer.max_steps, or schedule=constant."
+    )
+
+
+def test_a_schedule_is_not_stretched_when_a_run_goes_on(command: Command, tmp_path: Path) -> None:
+    done = command("train", *QUIET, "schedule=warmup_cosine", "+trainer.max_steps=4", "test=false")
+    assert done.code == 0, done.err
+    run = only_run(tmp_path, "default")
+    done = command("train", f"resume={run}", "+trainer.max_steps=6")
+    assert done.code == 1
+    assert last_line(done.err) == (
+        "hudepth-train: resume: the learning-rate schedule of this run is laid out over 4 steps, and now there would "
+        "be 6. Leave trainer.accumulate_grad_batches, trainer.limit_train_batches and the number of devices as they were, "
+        "or start a new run."
+    )
+
+
+def test_early_stopping_waits_for_the_full_size(command: Command, tmp_path: Path) -> None:
+    options = ("data.progressive=[{size:[16,32],until:0.8}]", "callbacks=early_stopping", "optim.lr=1e-30")
+    patience = ("callbacks.early_stopping.patience=1", "trainer.max_epochs=10")
+    done = command("train", *QUIET, *options, *patience, "test=false")
+    assert done.code == 0, done.err
+    run = only_run(tmp_path, "default")
+    assert (run / "checkpoints" / "best.ckpt").is_file()
+    assert len(rows(run, "metrics.csv")) == 10
+
+
+def test_recomputed_activations_cannot_be_compiled(command: Command) -> None:
+    done = command("train", *QUIET, "compile=true", "model=hybrid_unet", "model.recompute=true")
+    assert last_line(done.err) == (
+        "hudepth-train: compile: torch.compile cannot compile model.recompute. Leave one of them false."
+    )
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
@@ -173,6 +228,30 @@ def test_a_start_that_has_seen_what_is_to_judge_it_is_refused(command: Command, 
     assert "pairs were trained on, under data.split=random. Pass the same data.split, or init=null." in done.err
 
 
+def test_a_start_of_other_files_of_the_same_set_is_named(command: Command, tmp_path: Path) -> None:
+    assert command("train", *QUIET, "name=first", "test=false", "paths.runs=elsewhere").code == 0
+    done = command(
+        "train", *QUIET, "init=last", "paths.runs=elsewhere", "name=second", "data.source.seed=5", "test=false"
+    )
+    assert done.code == 0, done.err
+    assert "was trained on another set of rooms, or on other files of this one" in done.err
+
+
+@pytest.mark.parametrize("damage", [{"before": "rooms"}, {"before": [1]}, {"split": {"kind": "random"}}])
+def test_a_start_that_does_not_say_what_it_was_trained_on(
+    damage: dict[str, Any], command: Command, tmp_path: Path
+) -> None:
+    assert command("train", *QUIET, "name=first", "test=false").code == 0
+    file = only_run(tmp_path, "first") / "checkpoints" / "best.ckpt"
+    content = torch.load(file, weights_only=True)
+    record = content["hudepth"]
+    (record["data"] if "before" in damage else record).update(damage)
+    torch.save(content, tmp_path / "alone.ckpt")
+    done = command("train", *QUIET, f"init={tmp_path / 'alone.ckpt'}", "name=second")
+    assert done.code == 1
+    assert re.search(r"does not say what it was trained on|named without its split", last_line(done.err))
+
+
 def test_a_start_of_another_network_is_refused(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=first", "test=false").code == 0
     done = command("train", *QUIET, f"init={only_run(tmp_path, 'first')}", "model=hybrid_unet", "name=second")
@@ -195,6 +274,17 @@ def test_each_look_at_the_test_images_is_kept(command: Command, tmp_path: Path) 
     others = {look["epoch"] for look in json.loads((run / "scored.json").read_text())} - {3}
     assert metrics["checkpoint"]["scored_before"] == sorted(others)
     assert len(json.loads((run / "scored.json").read_text())) == 3
+
+
+def test_a_test_is_not_lost_because_it_cannot_be_noted(command: Command, tmp_path: Path) -> None:
+    assert command("train", *QUIET, "test=false").code == 0
+    run = only_run(tmp_path, "default")
+    (run / "scored.json").mkdir()
+    done = command("test", f"checkpoint={run}", "output=results", "protocol=paper", "baselines=false")
+    assert done.code == 0, done.err
+    assert f"'{run}' cannot note that its test images were looked at" in done.err
+    metrics = json.loads((tmp_path / "results" / "paper" / "metrics.json").read_text())
+    assert metrics["checkpoint"]["scored_before"] is None
 
 
 @pytest.fixture
