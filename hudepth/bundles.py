@@ -23,7 +23,7 @@ from hudepth.errors import CheckpointError
 CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
 KIND = "hudepth-bundle"
 PRETRAINED = ("nyu",)
-"""Names that ``checkpoint=`` keeps for models that come with hudepth. The weights of ``nyu`` are not published yet."""
+"""Names that ``checkpoint=`` keeps for models that come with hudepth: ``nyu``, from ``experiments/strong_official``."""
 MAX_CONFIG_BYTES = 1 << 22
 MAX_WEIGHTS_BYTES = 1 << 32
 

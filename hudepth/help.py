@@ -20,10 +20,10 @@ USAGE = {
     "test": "hudepth-test checkpoint=<file | run directory | last> [data=NAME] [protocol=NAME] [key=value ...]",
     "data": "hudepth-data prepare|info|audit data=NAME [data.root=PATH] [key=value ...]",
     "report": "hudepth-report compare|table|sweep|figures|paper [key=value ...]",
-    "predict": "hudepth-predict checkpoint=<model> input=<image | folder | 'glob' | video | camera> [output=DIR]",
+    "predict": "hudepth-predict [checkpoint=<model>] input=<image | folder | 'glob' | video | camera> [output=DIR]",
     "export": "hudepth-export checkpoint=<model> format=[onnx,openvino,torch_export,int8,bundle] [output=DIR]",
     "bench": "hudepth-bench checkpoint=<model> | model=NAME [key=value ...]",
-    "demo": "hudepth-demo checkpoint=<model> [port=7860]",
+    "demo": "hudepth-demo [checkpoint=<model>] [port=7860]",
 }
 
 EXAMPLES = {
@@ -63,9 +63,10 @@ EXAMPLES = {
     ),
     "predict": (
         (
-            "hudepth-predict checkpoint=last input=photos",
+            "hudepth-predict input=photos",
             "a folder: 16-bit PNG [mm], npy [m] and a picture for each image",
         ),
+        ("hudepth-predict checkpoint=last input=photos", "the newest run instead of the model that comes along"),
         ("hudepth-predict checkpoint=model.onnx input=a.jpg formats=[ply]", "a point cloud, from an exported file"),
         ("hudepth-predict checkpoint=last input=walk.mp4 smoothing=0.6", "a video of depth, steadied"),
         ("hudepth-predict checkpoint=last input=0 frames=100", "the first camera"),
@@ -84,7 +85,8 @@ EXAMPLES = {
         ),
     ),
     "demo": (
-        ("hudepth-demo checkpoint=last", "at http://127.0.0.1:7860, for this machine alone"),
+        ("hudepth-demo", "at http://127.0.0.1:7860, for this machine alone"),
+        ("hudepth-demo checkpoint=last", "the newest run instead of the model that comes along"),
         ("hudepth-demo checkpoint=model.onnx port=8000", "an exported file, on another port"),
     ),
 }

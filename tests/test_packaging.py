@@ -12,6 +12,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+SHIPPED = (
+    "hudepth/",
+    "conf/",
+    "experiments/strong_official/__init__.py",
+    "experiments/strong_official/nyu/",
+    "pyproject",
+    "README",
+    "LICENSE",
+)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -21,7 +30,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, text=True, capture_output=True, check=False).stdout.split()
     for name in listed or [str(p.relative_to(ROOT)) for p in ROOT.rglob("*") if ".venv" not in p.parts and p.is_file()]:
-        if name.startswith(("hudepth/", "conf/", "pyproject", "README", "LICENSE")) and (ROOT / name).is_file():
+        if name.startswith(SHIPPED) and (ROOT / name).is_file():
             (folder / "src" / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / "src" / name).write_bytes((ROOT / name).read_bytes())
     build = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
@@ -40,6 +49,12 @@ def test_the_wheel_holds_every_module_and_configuration(site: Path) -> None:
                 if path.parent.name == "hydra_plugin":
                     place = site / "hydra_plugins" / "hudepth" / path.name
                 assert place.is_file(), path
+
+
+def test_the_wheel_brings_a_model(site: Path) -> None:
+    held = {path.name for path in (site / "hudepth" / "pretrained").rglob("*") if path.is_file()}
+    assert held == {"__init__.py", "config.json", "model.safetensors", "README.md"}
+    assert (site / "hudepth" / "pretrained" / "nyu" / "model.safetensors").stat().st_size < 10_000_000
 
 
 def test_the_wheel_runs_from_anywhere(site: Path, tmp_path: Path) -> None:

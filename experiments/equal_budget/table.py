@@ -21,7 +21,7 @@ from hudepth.files import write_between
 
 HERE = Path(__file__).parent
 RUNS = ("badcl", "strong")
-SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "edge_f1_0.25", "edge_f1_0.5", "si_boundary_f1")
+SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "edge_f1_0.25", "edge_f1_0.5")
 
 
 def table(document: dict[str, Any]) -> str:

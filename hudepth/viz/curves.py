@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hudepth.errors import DataError
+from hudepth.metrics.summary import DEPTH_NAMES
 from hudepth.viz.panels import save_figure
 
 
@@ -52,6 +53,8 @@ def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> F
     for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         for stage, label in (("train", "training"), ("val", "validation")):
             key = f"{stage}/{name}"
+            if stage == "val" and name in DEPTH_NAMES:  # the metric of that name, in another unit: silog
+                continue
             points = [(row["epoch"], row[key]) for row in history if key in row]  # not every epoch validates
             if points:
                 axis.plot(*zip(*points, strict=True), marker=".", label=label)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import hudepth
 from hudepth.inference.info import ModelInfo
 from hudepth.inference.model import DepthModel
 
@@ -29,3 +30,13 @@ def test_flipping_averages_with_the_mirrored_image_mirrored_back(grey: DepthMode
     for image, before, after in zip(images, plain, flipped, strict=True):
         np.testing.assert_allclose(before.metres, image.mean(-1) + 0.1 * np.arange(width), rtol=1e-5)
         np.testing.assert_allclose(after.metres, image.mean(-1) + 0.1 * (width - 1) / 2, rtol=1e-5)
+
+
+def test_the_model_that_comes_along_sees_depth() -> None:
+    model = hudepth.load("nyu")
+    assert model.info.size == (224, 224)
+    floor = np.zeros((240, 320, 3), np.uint8)
+    floor[:] = np.linspace(60, 200, 240).astype(np.uint8)[:, None, None]
+    metres = model.predict(floor).metres
+    assert metres.shape == (240, 320)
+    assert 0.3 < metres.min() < metres.max() < 10

@@ -161,8 +161,8 @@ def test_a_schedule_is_not_stretched_when_a_run_goes_on(command: Command, tmp_pa
     assert done.code == 1
     assert last_line(done.err) == (
         "hudepth-train: resume: the learning-rate schedule of this run is laid out over 4 steps, and now there would "
-        "be 6. Leave trainer.accumulate_grad_batches, trainer.limit_train_batches and the number of devices as they were, "
-        "or start a new run."
+        "be 6. Leave trainer.accumulate_grad_batches, trainer.limit_train_batches and the number of devices as they "
+        "were, or start a new run."
     )
 
 

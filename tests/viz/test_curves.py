@@ -134,3 +134,12 @@ def test_damaged_history_is_one_line(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(DataError) as caught:
         read_history(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_metric_is_not_drawn_as_the_loss_of_its_name() -> None:
+    rows = [
+        {"epoch": e, "train/total": 1.0, "val/total": 1.0, "train/silog": 2.0, "val/silog": 20.0} for e in (1.0, 2.0)
+    ]
+    total, silog = draw_curves(rows).axes
+    assert len(total.lines) == 2
+    assert [line.get_label() for line in silog.lines] == ["training"]

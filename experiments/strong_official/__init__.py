@@ -1,0 +1,1 @@
+"""Installed as ``hudepth.pretrained``: its folder ``nyu`` is the model that ``checkpoint=nyu`` names."""
