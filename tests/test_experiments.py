@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 import json
 import re
@@ -94,3 +95,52 @@ def test_no_study_names_folders_of_the_machine_it_ran_on() -> None:
     for file in STUDIES.rglob("*"):
         if file.suffix in suffixes:
             assert not re.search(r"/(root|work|home)/", file.read_text()), file
+
+
+def test_time_to_accuracy() -> None:
+    study = STUDIES / "time_to_accuracy"
+    table = load(study / "table.py").table()
+    assert (study / "README.md").read_text().split("<!-- table -->\n")[1].strip() == table
+    share = float(table.splitlines()[-1].split("|")[-2])
+    assert 0 < share < 0.5
+
+
+def test_equal_budget() -> None:
+    study = STUDIES / "equal_budget"
+    document = json.loads((study / "compare" / "compare.json").read_text())
+    assert (study / "README.md").read_text().split("<!-- table -->\n")[1].strip() == load(study / "table.py").table(
+        document
+    )
+    seen = {}
+    for name in ("badcl", "strong"):
+        with (study / name / "times.csv").open() as file:
+            seen[name] = int(list(csv.DictReader(file))[-1]["images"])
+    with (STUDIES / "strong_official" / "pretrain" / "times.csv").open() as file:
+        seen["strong"] += int(list(csv.DictReader(file))[-1]["images"])
+    assert seen == {"badcl": 41_880, "strong": 41_886}
+
+
+def test_what_the_readme_says_of_the_recipes() -> None:
+    readme = (STUDIES.parent / "README.md").read_text()
+    document = json.loads((STUDIES / "equal_budget" / "compare" / "compare.json").read_text())
+    row = document["metrics"]["abs_rel"]
+    assert f"test abs_rel is {-100 * row['difference'] / row['a']:.1f} % lower" in readme
+    assert document["metrics"]["edge_f1_0.25"]["verdict"] == "b better"
+    paper = find_result(STUDIES / "badcl_official", "eigen").metrics
+    assert f"reaches abs_rel {paper['abs_rel']:.3f} and delta1 {paper['delta1']:.3f}" in " ".join(readme.split())
+
+
+def test_the_model_that_comes_along_is_the_run_of_its_study() -> None:
+    study = STUDIES / "strong_official"
+    said = json.loads((study / "nyu" / "metrics" / "eigen.json").read_text())
+    assert (
+        said["metrics"]["model"]
+        == json.loads((study / "test" / "eigen" / "metrics.json").read_text())["metrics"]["model"]
+    )
+    assert len(json.loads((study / "scored.json").read_text())) == 1  # its test images were looked at once
+    assert (study / "nyu" / "model.safetensors").stat().st_size < 10_000_000
+
+
+def test_the_estimate_of_long_trainings_follows_from_what_was_measured() -> None:
+    page = (STUDIES.parent / "docs" / "scale.md").read_text()
+    assert page.split("<!-- estimate -->\n")[1].strip() == load(STUDIES / "speed" / "scale_estimate.py").estimate()
