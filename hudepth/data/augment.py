@@ -131,7 +131,7 @@ def change_colours(
         saturation: factor of the difference from each pixel's luma.
         tint: factor of each channel.
     """
-    image = image.clamp(1e-4, 1) ** gamma[:, None, None, None]
+    image = image.clamp(1e-4, 1).pow_(gamma[:, None, None, None])
     # What follows is linear in the colours of a pixel: one matrix and one offset for each image.
     # Constants are made where they are used: to copy them there, a GPU would have to be waited for.
     weights = torch.stack([torch.full_like(gamma[0], weight) for weight in BT601_LUMA])
@@ -284,8 +284,7 @@ class Augmentation:
         else:
             image, unit_depth = resize(image, unit_depth, size=size)
         if self.blur:
-            # half of the images stay sharp
-            image = blur(image, draw.uniform(-self.blur, self.blur).clamp_min(0), largest=self.blur)
+            image = self._blur(image, draw.uniform(-self.blur, self.blur))
         if self._colours:
             image = change_colours(
                 image,
@@ -297,10 +296,17 @@ class Augmentation:
             )
         if self.noise:
             sigma = draw.uniform(0, self.noise)[:, None, None, None]
-            image = (image + sigma * draw.normal_like(image)).clamp(0, 1)
+            image = draw.normal_like(image).mul_(sigma).add_(image).clamp_(0, 1)
         if self.cut_depth:
             image = cut_depth(image, unit_depth[:, :1].clamp(max=1), self._draw_box(draw))
         return image, unit_depth
+
+    def _blur(self, image: Tensor, sigma: Tensor) -> Tensor:
+        """Blur images; where sigma is negative, which is half of them, they stay sharp."""
+        if image.device.type != "cpu":  # to ask which, a GPU would have to be waited for
+            return blur(image, sigma.clamp_min(0), largest=self.blur)
+        rows = (sigma > 0).nonzero()[:, 0]
+        return image.index_copy(0, rows, blur(image[rows], sigma[rows], largest=self.blur)) if len(rows) else image
 
     def _draw_geometry(self, draw: _Draw) -> Geometry:
         zoom = torch.where(draw.chance(self.zoom_chance), draw.log_uniform(*self.zoom), 1.0)
