@@ -54,7 +54,8 @@ def estimate() -> str:
     slow, fast = (share * PEAK_TFLOPS * 1000 / work for share in SHARES)
     workers = math.ceil(fast / rates["loader"])
     lines = [
-        f"Measured on {CORES} CPU cores: the loader reads {rates['loader']:,.0f} images/s, augmentation, which runs "
+        f"Measured on {CORES} CPU cores (of two machines, see experiments/speed): the loader reads "
+        f"{rates['loader']:,.0f} images/s, augmentation, which runs "
         f"where the network does, changes {rates['augmentation']:,.0f}, training steps take {rates['step']:.1f}. A "
         f"step is {work:.1f} GFLOP an image (three times the counted forward pass), so these cores compute "
         f"{rates['step'] * work:.0f} GFLOP/s. Assumed of an H100 with `trainer.precision=bf16-mixed "
