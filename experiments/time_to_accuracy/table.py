@@ -1,15 +1,18 @@
 """When does each run first reach the best validation abs_rel of the paper's recipe? From the runs' own histories.
 
-python experiments/time_to_accuracy/table.py [<run of the paper's recipe> <run of experiment/strong>]
+python experiments/time_to_accuracy/table.py [<run of the paper's recipe> <run of experiment/strong> [<text to cut>]]
 
 With two runs, their histories are copied here first.
 """
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from publish import copy_run, hide
 
 from hudepth.files import write_between
 from hudepth.times import read_times
@@ -17,7 +20,6 @@ from hudepth.viz.curves import read_history
 
 HERE = Path(__file__).parent
 RUNS = ("badcl", "strong")
-KEPT = ("metrics.csv", "times.csv", "config.yaml", "overrides.txt", "environment.json", "split.json")
 METRIC = "val/abs_rel"
 
 
@@ -48,13 +50,12 @@ def table() -> str:
     return "\n".join(lines)
 
 
-def main(*runs: Path) -> None:
-    for name, run in zip(RUNS, runs, strict=False):
-        (HERE / name).mkdir(exist_ok=True)
-        for file in KEPT:
-            shutil.copy(run / file, HERE / name / file)
+def main(*words: str) -> None:
+    for name, run in zip(RUNS, words[:2], strict=False):
+        copy_run(Path(run), HERE / name)
+    hide(HERE, list(words[2:]))
     write_between(HERE / "README.md", "table", table())
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:]))
+    main(*sys.argv[1:])
