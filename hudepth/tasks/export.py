@@ -131,7 +131,7 @@ def _int8(work: Work, output: Path, _tolerance_mm: float) -> dict[str, Any]:
     parity = compare(backend, work.reference, work.images.compared)
     accuracy: dict[str, Any] = {}
     if work.config["accuracy"] and work.images.datamodule is not None:
-        accuracy = int8_accuracy(work.reference, backend, work.images.datamodule, config=work.config)
+        accuracy = int8_accuracy(work.checkpoint, work.reference, backend, work.images.datamodule, config=work.config)
     elif work.config["accuracy"]:
         log.warning("int8: its loss of accuracy is not measured, since the checkpoint's data is not here.")
     kept = _keep([path, path.with_suffix(".bin")], output, parity)

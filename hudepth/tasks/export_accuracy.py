@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
+from hudepth.checkpoint import Checkpoint
 from hudepth.console import shows_progress
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation import Evaluation
@@ -22,6 +23,7 @@ from hudepth.metrics.summary import summarise
 from hudepth.normalise import denormalise_image
 from hudepth.tasks.common import build_protocols, without_known_warnings
 from hudepth.tasks.devices import build_trainer
+from hudepth.tasks.lineage import note_scored
 
 SHOWN = ("abs_rel", "rmse", "delta1")
 FLOAT, INT8 = "float32", "int8"
@@ -41,12 +43,18 @@ class _Quantised(nn.Module):
 
 
 def int8_accuracy(
-    reference: TorchBackend, quantised: Backend, datamodule: DepthDataModule, *, config: dict[str, Any]
+    checkpoint: Checkpoint,
+    reference: TorchBackend,
+    quantised: Backend,
+    datamodule: DepthDataModule,
+    *,
+    config: dict[str, Any],
 ) -> dict[str, Any]:
-    """Test both under the configured protocol, print what changes, and return it.
+    """Test both under the configured protocol, print what changes, and return it; the checkpoint's run notes the test.
 
     Args:
-        reference: the checkpoint.
+        checkpoint: what was quantised.
+        reference: its network as it was trained.
         quantised: its int8 form.
         datamodule: with the test subset.
         config: of hudepth-export.
@@ -67,6 +75,7 @@ def int8_accuracy(
             enable_progress_bar=shows_progress(), callbacks=[RichProgressBar()] if shows_progress() else None,
         )  # fmt: skip
         trainer.test(evaluation, datamodule=datamodule, verbose=False)
+    note_scored(checkpoint, datamodule, protocols)
     records = [datamodule.store.records[index] for index in evaluation.indices]
     changes: dict[str, Any] = {}
     for protocol in protocols:

@@ -1,4 +1,4 @@
-"""What a network has seen before: no pair that it, or what it started from, was trained on may score it."""
+"""What a network has seen before: no pair that it, or what it started from, learned or was chosen by may score it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def recorded_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split
 
 
 def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *, subsets: tuple[str, ...]) -> None:
-    """Refuse a split that would judge a network by pairs it was trained on, where the data is a set of its training.
+    """Refuse a split that would judge a network by pairs it has seen, where the data is a set of its training.
+
+    Training pairs were seen, and for a test so were validation pairs: its best epoch was chosen by them.
 
     Args:
         checkpoint: the network, or what it starts from.
@@ -57,13 +59,15 @@ def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *
                 )  # fmt: skip
             continue
         trained = (recorded_split(checkpoint, datamodule) if number == 0 else None) or _split_again(past, datamodule)
-        for subset in subsets:
-            shared = set(trained.train) & set(datamodule.split[subset])
+        looks = [(subset, trained.train, "trained on") for subset in subsets]
+        looks += [("test", trained.val, "validated on")] if "test" in subsets else []
+        for subset, seen, how in looks:
+            shared = set(seen) & set(datamodule.split[subset])
             if shared:
                 name = {"val": "validation"}.get(subset, subset)
                 raise DataError(
                     f"data.split={datamodule.split.kind}: {len(shared)} of {len(datamodule.split[subset])} {name} "
-                    f"pairs were trained on, under data.split={trained.kind}. "
+                    f"pairs were {how}, under data.split={trained.kind}. "
                     + (
                         "Leave data.split out to test on what was held out."
                         if subsets == ("test",)

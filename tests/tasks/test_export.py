@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import subprocess
 import zipfile
 from dataclasses import replace
@@ -32,8 +33,10 @@ EXACT = ("model.onnx", "model.pt2", "model.xml", "tiny")
 def exported(trained: Path, tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     """All formats of the tiny run, by the installed script from another directory."""
     folder = tmp_path_factory.mktemp("exported")
+    run = folder / "runs" / "tiny" / trained.name  # int8 is tested, which the run notes
+    shutil.copytree(trained, run)
     formats = "format=[onnx,torch_export,openvino,int8,bundle]"
-    arguments = (f"checkpoint={trained}", formats, "compared=4", "calibration=8", "output=out")
+    arguments = (f"checkpoint={run}", formats, "compared=4", "calibration=8", "output=out")
     done = subprocess.run(**script("export", *arguments, cwd=folder, cache=cache), check=False)
     assert done.returncode == 0, done.stdout
     (folder / "out" / "log.txt").write_text(done.stdout)
@@ -64,6 +67,16 @@ def test_int8_says_what_it_costs(exported: Path) -> None:
     log = (exported / "log.txt").read_text()
     assert "int8: eigen protocol, 2 test images of rooms" in log
     assert f"{record['delta1']['int8']:.4f}" in log
+
+
+def test_a_run_notes_that_int8_was_tested(exported: Path, trained: Path) -> None:
+    (run,) = (exported.parent / "runs" / "tiny").iterdir()
+    before = json.loads((trained / "scored.json").read_text())
+    after = json.loads((run / "scored.json").read_text())
+    assert after[:-1] == before
+    assert {key: value for key, value in after[-1].items() if key != "time"} == {
+        **{key: value for key, value in before[0].items() if key != "time"}, "protocols": ["eigen"],
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", EXACT)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from hudepth.checkpoint import KEY, read_plain
+from hudepth.checkpoint import KEY, load_checkpoint, read_plain
+from hudepth.errors import DataError
+from hudepth.tasks.lineage import refuse_training_pairs
+from hudepth.tasks.test import open_data
 
 from .conftest import TINY, Command
 
@@ -169,6 +173,18 @@ def test_training_pairs_are_not_tested_on(command: Command, trained: Path) -> No
     done = command("test", f"checkpoint={trained}", "data.split=random", "output=scores")
     assert done.code == 1
     assert "test pairs were trained on, under data.split=official." in done.err.splitlines()[-1]
+
+
+def test_pairs_that_chose_the_best_epoch_are_not_tested_on(trained: Path) -> None:
+    checkpoint = load_checkpoint(str(trained))
+    datamodule, _ = open_data(checkpoint, {}, overrides=[], trust=[])
+    split = datamodule.split
+    datamodule.split = replace(split, val=split.test, test=split.val)
+    with pytest.raises(
+        DataError, match=r"test pairs were validated on, under data\.split=official\. Leave data\.split"
+    ):
+        refuse_training_pairs(checkpoint, datamodule, subsets=("test",))
+    refuse_training_pairs(checkpoint, datamodule, subsets=("val",))
 
 
 def test_an_output_in_the_way_is_found_before_the_work(command: Command, trained: Path, tmp_path: Path) -> None:
