@@ -90,10 +90,10 @@ class EpochLine(Callback):
         monitor: the metric that decides which checkpoint is best, shown after the losses.
     """
 
-    SHOWN = ("val/abs_rel", "val/rmse", "val/delta1")
+    LOSSES, SHOWN = ("train/total", "val/total"), ("val/abs_rel", "val/rmse", "val/delta1")
 
     def __init__(self, monitor: str) -> None:
-        self.shown = tuple(dict.fromkeys((monitor, *self.SHOWN)))
+        self.shown = tuple(dict.fromkeys((*self.LOSSES, monitor, *self.SHOWN)))
         self._start = 0.0
         self._first = 0
 
@@ -109,9 +109,7 @@ class EpochLine(Callback):
         done = trainer.current_epoch + 1 - self._first
         each = (time.monotonic() - self._start) / done
         left = max(0, (trainer.max_epochs or 0) - trainer.current_epoch - 1)
-        values = [
-            f"{name} {metrics[name]:.4f}" for name in ("train/total", "val/total", *self.shown) if name in metrics
-        ]
+        values = [f"{name} {metrics[name]:.4f}" for name in self.shown if name in metrics]
         ending = f"{duration(each)} an epoch" + (f", {duration(each * left)} left" if left else "")
         log.info("epoch %d of %s: %s (%s)", trainer.current_epoch + 1, trainer.max_epochs, ", ".join(values), ending)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import re
 import sys
@@ -80,6 +81,7 @@ def _main(task: str) -> int:
     debug = [argument for argument in arguments if argument in ("debug=true", "debug=false")]
     try:
         sys.argv[1:] = rewrite(task, [argument for argument in arguments if argument not in debug])
+        _check_launcher(sys.argv[1:])
         return _run_hydra(task)
     except KeyboardInterrupt:
         return 130
@@ -120,6 +122,22 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     if task in ("test", "report", "export", "bench") and not any(a.startswith(("data=", "+data=")) for a in result):
         result = [f"++{a}" if a.startswith("data.") else a for a in result]
     return result
+
+
+def _check_launcher(arguments: list[str]) -> None:
+    """Refuse a launcher whose package is not installed: Hydra would blame whatever has a comma in it.
+
+    Raises:
+        ConfigError: if it is not.
+    """
+    for argument in arguments:
+        group, _, name = argument.partition("=")
+        if group == "hydra/launcher" and name in LAUNCHERS:
+            package = f"hydra_plugins.hydra_{name.partition('_')[0]}_launcher"
+            if importlib.util.find_spec(package) is None:
+                raise ConfigError(
+                    f"{argument}: its package is not installed. Run pip install 'hudepth[{LAUNCHERS[name]}]'."
+                )
 
 
 def _run_hydra(task: str) -> int:
@@ -188,8 +206,6 @@ def _config_line(error: BaseException, task: str) -> str | None:
     text = str(error)
     if found := re.search(r"Could not find '([^']+)'", text):
         group, _, name = found[1].rpartition("/")
-        if group == "hydra/launcher" and name in LAUNCHERS:
-            return f"{group}={name}: its package is not installed. Run pip install 'hudepth[{LAUNCHERS[name]}]'."
         options = options_of(group)
         if options:
             options += [each for each in (*LAUNCHERS, "basic") if group == "hydra/launcher" and each not in options]

@@ -172,7 +172,8 @@ def test_epoch_line(data: DepthDataModule, tmp_path: Path, caplog: pytest.LogCap
 
 
 def test_the_monitored_metric_is_shown_once() -> None:
-    assert EpochLine("val/rmse").shown == ("val/rmse", "val/abs_rel", "val/delta1")
+    assert EpochLine("val/rmse").shown == ("train/total", "val/total", "val/rmse", "val/abs_rel", "val/delta1")
+    assert EpochLine("train/total").shown == ("train/total", "val/total", "val/abs_rel", "val/rmse", "val/delta1")
 
 
 # --- Ctrl-C ---

@@ -6,7 +6,6 @@ where each belongs, and what came of them.
 
 from __future__ import annotations
 
-import importlib.util
 import shlex
 import shutil
 import sys
@@ -25,7 +24,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from hudepth import run_dir
-from hudepth.cli import LAUNCHERS, one_line
+from hudepth.cli import one_line
 from hudepth.errors import ConfigError
 from hudepth.machine import usable_cores
 from hudepth.sweeps import FAILED, FINISHED, PRUNED, read_jobs, write_jobs
@@ -174,14 +173,6 @@ class Sweep(Sweeper):
 
     def _check_launcher(self) -> None:
         target = str(self.master.hydra.launcher._target_)
-        package = ".".join(target.split(".")[:2])
-        try:
-            found = importlib.util.find_spec(package) is not None
-        except ModuleNotFoundError:
-            found = False
-        if not found:
-            extra = next((extra for name, extra in LAUNCHERS.items() if f"_{name}_" in package), "joblib")
-            raise ConfigError(f"hydra/launcher: '{package}' is not installed. Run pip install 'hudepth[{extra}]'.")
         if target.endswith("SlurmLauncher") and shutil.which("srun") is None:
             raise ConfigError(
                 "hydra/launcher: there is no SLURM here (no srun on the path). Run it on a cluster's login node, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -248,20 +249,22 @@ def test_mistakes_give_one_line(
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize("name", ["ray", "joblib"])
-def test_a_launcher_that_is_not_installed(command: Command, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hudepth.tasks.sweep import importlib as found_by
+@pytest.mark.parametrize("jobs", ["loss=l1,l2", "variant=l1,silog"])
+@pytest.mark.parametrize(("name", "extra"), [("ray", "ray"), ("joblib", "joblib"), ("submitit_local", "slurm")])
+def test_a_launcher_that_is_not_installed(
+    command: Command, name: str, extra: str, jobs: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_spec = importlib.util.find_spec
 
-    if name == "ray":
-        message = "hydra/launcher=ray: its package is not installed. Run pip install 'hudepth[ray]'."
-    else:
-        monkeypatch.setattr(found_by.util, "find_spec", lambda _: None)
-        message = (
-            "hydra/launcher: 'hydra_plugins.hydra_joblib_launcher' is not installed. Run pip install 'hudepth[joblib]'."
-        )
-    done = sweep(command, "loss=l1,l2", f"hydra/launcher={name}")
+    def without_launchers(package: str) -> object:
+        return None if package.endswith("_launcher") else find_spec(package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", without_launchers)
+    done = command("train", "+sweep=loss_terms", jobs, f"hydra/launcher={name}")
     assert done.code == 1
-    assert done.err.splitlines() == [f"hudepth-train: {message}"]
+    assert done.err.splitlines() == [
+        f"hudepth-train: hydra/launcher={name}: its package is not installed. Run pip install 'hudepth[{extra}]'."
+    ]
 
 
 def test_two_commands_do_not_run_one_sweep(command: Command, tmp_path: Path) -> None:
