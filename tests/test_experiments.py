@@ -141,6 +141,33 @@ def test_the_model_that_comes_along_is_the_run_of_its_study() -> None:
     assert (study / "nyu" / "model.safetensors").stat().st_size < 10_000_000
 
 
+def test_what_the_study_of_the_model_that_comes_along_says_of_its_trainings() -> None:
+    study = STUDIES / "strong_official"
+    text = " ".join((study / "README.md").read_text().split())
+    first, second = (read_history(study / name / "metrics.csv") for name in ("first", "second"))
+    # only epochs at full size can be best: those after the 39th of the first, and all of the second
+    best = [min(rows, key=lambda row: row["val/abs_rel"]) for rows in (first[39:], second)]
+    for row in best:
+        assert f"| {row['val/abs_rel']:.4f} | {row['val/delta1']:.3f} |" in text
+    gained = 1 - best[1]["val/abs_rel"] / best[0]["val/abs_rel"]
+    assert f"again took {100 * gained:.1f} % off its abs_rel" in text
+    assert f"was at validation delta1 {first[38]['val/delta1']:.3f} (epoch 39)" in text
+    assert f"to {best[0]['val/delta1']:.3f} at the best abs_rel and to {first[59]['val/delta1']:.3f} after" in text
+    fifth, last = second[4], second[-1]
+    assert f"falls from {fifth['val/abs_rel']:.3f} to {last['val/abs_rel']:.3f}" in text
+    assert f"training loss by {100 * (1 - last['train/total'] / fifth['train/total']):.0f} %" in text
+    before, now = (find_result(study / name, "eigen").metrics for name in ("first", "."))
+    assert f"abs_rel {before['abs_rel']:.3f}, delta1 {before['delta1']:.3f})" in text
+    assert (
+        f"F1 at 0.25 was {before['edge_f1_0.25']:.3f} after the first training and is {now['edge_f1_0.25']:.3f}" in text
+    )
+    paper = find_result(STUDIES / "badcl_official", "eigen").metrics
+    assert f"Abs_rel is {100 * (1 - now['abs_rel'] / paper['abs_rel']):.0f} % lower" in text
+    chosen = json.loads((study / "nyu" / "config.json").read_text())["epoch"]
+    losses = [row["train/total"] for row in read_history(study / "metrics.csv")]
+    assert chosen == len(losses) - 1 == losses.index(min(losses)) + 1  # the last but one
+
+
 def test_the_estimate_of_long_trainings_follows_from_what_was_measured() -> None:
     page = (STUDIES.parent / "docs" / "scale.md").read_text()
     assert page.split("<!-- estimate -->\n")[1].strip() == load(STUDIES / "speed" / "scale_estimate.py").estimate()
