@@ -255,6 +255,14 @@ def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataM
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))
     checkpoint.fill(net)
     log.info("init: weights of '%s', epoch %d", checkpoint.path, checkpoint.epoch)
+    trained = checkpoint.config.get("data")
+    before_m = trained.get("max_depth_m") if isinstance(trained, dict) else None
+    if before_m != datamodule.max_depth_m:
+        log.warning(
+            "init: these weights answer in shares of %s m, this training in shares of %s m, so all depths are learned "
+            "anew. Pass data.max_depth_m=%s to keep them.",
+            before_m, datamodule.max_depth_m, before_m,
+        )  # fmt: skip
     return lineage(checkpoint)
 
 

@@ -212,6 +212,17 @@ def test_training_can_start_from_another_run(command: Command, tmp_path: Path) -
     (before,) = went_on.data["before"]
     assert before["fingerprint"] == begun.data["fingerprint"] != went_on.data["fingerprint"]
     assert before["split"] == begun.split
+    assert "in shares of" not in done.err
+
+
+def test_a_start_with_another_largest_depth_is_named(command: Command, tmp_path: Path) -> None:
+    assert command("train", *QUIET, "name=first", "test=false").code == 0
+    done = command(
+        "train", *QUIET, "name=second", f"init={only_run(tmp_path, 'first')}", "data.max_depth_m=20", "test=false"
+    )
+    assert done.code == 0, done.err
+    assert "init: these weights answer in shares of 10.0 m, this training in shares of 20" in done.err
+    assert "Pass data.max_depth_m=10.0 to keep them." in done.err
 
 
 def test_a_start_that_has_seen_what_is_to_judge_it_is_refused(command: Command, tmp_path: Path) -> None:
