@@ -35,8 +35,6 @@ class Geometry:
     """By which the camera is rolled [radians], clockwise."""
     flip: Bool[Tensor, " b"]
     """Left and right swapped."""
-    border: float = 0.0
-    """Share of each side that was cut off before zooming."""
 
 
 def warp(
@@ -64,22 +62,14 @@ def warp(
     Returns:
         Images and depths of ``size``.
     """
-    extent = (1 - 2 * geometry.border) / geometry.zoom
-    cos, sin = geometry.angle.cos() * extent, geometry.angle.sin() * extent
+    cos, sin = geometry.angle.cos() / geometry.zoom, geometry.angle.sin() / geometry.zoom
     mirror = torch.where(geometry.flip, -1.0, 1.0).to(cos)
     along_x = torch.stack([cos * mirror, sin * aspect * mirror], dim=1)
     along_y = torch.stack([-sin / aspect, cos], dim=1)
     grid = _affine_grid(along_x, along_y, geometry.centre, size)
-    kept = 1 - 2 * geometry.border
     image = _at_most_twice(image, size)
-    inside = grid
-    if geometry.border:  # neither a rolled corner nor linear interpolation may reach what was cut off
-        reaches = [kept - 1 / side for side in image.shape[:-3:-1]]
-        inside = torch.stack([grid[..., i].clamp(-reach, reach) for i, reach in enumerate(reaches)], dim=-1)
-    image = functional.grid_sample(image, inside, mode="bilinear", padding_mode="border", align_corners=False)
+    image = functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
     depth = functional.grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)
-    if geometry.border:
-        depth = torch.where((grid.abs() <= kept).all(dim=-1)[:, None], depth, 0.0)
     return image, depth / geometry.zoom[:, None, None, None]
 
 
@@ -92,6 +82,15 @@ def _affine_grid(along_x: Tensor, along_y: Tensor, centre: Tensor, size: tuple[i
     columns = width[:, None] * along_x[:, None, :]
     rows = height[:, None] * along_y[:, None, :] + centre[:, None, :]
     return rows[:, :, None, :] + columns[:, None, :, :]
+
+
+def cut_border(
+    image: Float[Tensor, "b 3 h w"], depth: Float[Tensor, "b d h w"], border: float
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
+    """Cut a share of each side off, and of a pixel that is partly in it the whole."""
+    top, left = (math.ceil(border * side - 1e-6) for side in image.shape[-2:])
+    height, width = image.shape[-2] - 2 * top, image.shape[-1] - 2 * left
+    return tuple(x.narrow(-2, top, height).narrow(-1, left, width) for x in (image, depth))  # type: ignore[return-value]
 
 
 def resize(
@@ -250,7 +249,7 @@ class Augmentation:
         self.flip, self.zoom_depth, self.rotate, self.border = flip, zoom_depth, math.radians(rotate_deg), border
         self.tint, self.grey, self.noise, self.blur = tint, grey, noise, blur
         self.cut_depth, self.cut_depth_size = cut_depth, cut_depth_size
-        self._moves = flip > 0 or self.zoom != (1.0, 1.0) or rotate_deg > 0 or border > 0
+        self._moves = flip > 0 or self.zoom != (1.0, 1.0) or rotate_deg > 0
         self._colours = (
             tint > 0
             or grey > 0
@@ -276,6 +275,7 @@ class Augmentation:
             generator: of the CPU, whatever device the batch is on: the same draws everywhere.
         """
         draw = _Draw(len(image), generator, image.device)
+        image, unit_depth = cut_border(image, unit_depth, self.border)
         if self._moves:
             geometry = self._draw_geometry(draw)
             image, unit_depth = warp(image, unit_depth, geometry, size=size, aspect=aspect)
@@ -310,13 +310,12 @@ class Augmentation:
 
     def _draw_geometry(self, draw: _Draw) -> Geometry:
         zoom = torch.where(draw.chance(self.zoom_chance), draw.log_uniform(*self.zoom), 1.0)
-        room = (1 - 2 * self.border) * (1 - 1 / zoom)
+        room = 1 - 1 / zoom
         return Geometry(
             zoom=zoom,
             centre=torch.stack([room * draw.uniform(-1, 1), room * draw.uniform(-1, 1)], dim=1),
             angle=draw.uniform(-self.rotate, self.rotate),
             flip=draw.chance(self.flip),
-            border=self.border,
         )
 
     def _draw_box(self, draw: _Draw) -> Tensor:

@@ -44,14 +44,12 @@ def geometry(
     centre: tuple[float, float] = (0.0, 0.0),
     angle: float = 0.0,
     flip: bool = False,
-    border: float = 0.0,
 ) -> Geometry:
     return Geometry(
         zoom=torch.full((count,), zoom),
         centre=torch.tensor([centre] * count),
         angle=torch.full((count,), angle),
         flip=torch.full((count,), flip),
-        border=border,
     )
 
 
@@ -493,15 +491,15 @@ def corners(picture: Tensor) -> tuple[Tensor, Tensor]:
 
 def test_crops_lie_anywhere_within_what_the_border_leaves() -> None:
     image = coordinates(400)
-    moved, depth = run(Augmentation(zoom=(1, 4), border=0.1), image, torch.ones(400, 1, 32, 32))
+    moved, depth = run(Augmentation(zoom=(1, 4), border=0.125), image, torch.ones(400, 1, 32, 32))
     zoom = 1 / depth[:, 0, 0, 0]
     left, right = corners(moved[:, 0, 16])
     top, bottom = corners(moved[:, 1, :, 16])
     for low, high in ((left, right), (top, bottom)):
-        assert low.min() >= -0.8 - 1e-4
-        assert high.max() <= 0.8 + 1e-4
-        torch.testing.assert_close(high - low, 1.6 / zoom, rtol=1e-3, atol=1e-3)
-        place = (low + 0.8) / (1.6 - (high - low))  # 0 is one side of the room, 1 the other
+        assert low.min() >= -0.75 - 1e-4
+        assert high.max() <= 0.75 + 1e-4
+        torch.testing.assert_close(high - low, 1.5 / zoom, rtol=1e-3, atol=1e-3)
+        place = (low + 0.75) / (1.5 - (high - low))  # 0 is one side of the room, 1 the other
         place = place[zoom > 1.2]
         assert place.min() < 0.02
         assert place.max() > 0.98
@@ -588,31 +586,24 @@ def test_it_is_the_truth_that_is_shown_not_what_comes_with_it() -> None:
     assert moved.unique().tolist() == [0, 0.5]
 
 
-@pytest.mark.parametrize("out", [(50, 50), (25, 25), (100, 40)])
-@pytest.mark.parametrize("options", [{}, {"zoom": (1, 4)}, {"flip": 0.5, "zoom": (1, 1.5)}])
-def test_a_frame_within_the_border_is_never_seen(options: dict[str, Any], out: tuple[int, int]) -> None:
-    image, depth = torch.zeros(100, 3, 50, 50), torch.ones(100, 1, 50, 50)
-    frame = torch.ones(50, 50, dtype=torch.bool)
-    frame[2:-2, 2:-2] = False  # the border has half a pixel more, by which interpolation looks about itself
-    image[:, :, frame], depth[:, :, frame] = 1.0, 100.0
-    moved, moved_depth = run(Augmentation(border=0.05, **options), image, depth, size=out)
-    assert moved.max() < 1e-4
-    assert moved_depth.max() <= 1
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"border": 0.04, "zoom": (1, 4)}, {"border": 0.1, "rotate_deg": 10}],
-    ids=["a border of just the frame's pixels", "rolled"],
-)
-def test_a_frame_is_not_seen_however_the_crop_lies(options: dict[str, Any]) -> None:
+@pytest.mark.parametrize("out", [(50, 50), (25, 25), (100, 40), (10, 7)])
+@pytest.mark.parametrize("border", [0.04, 0.031], ids=["the frame's pixels", "a part of the second pixel"])
+@pytest.mark.parametrize("options", [{}, {"zoom": (1, 4)}, {"flip": 0.5, "zoom": (1, 1.5)}, {"rotate_deg": 10}])
+def test_a_frame_within_the_border_is_never_seen(options: dict[str, Any], border: float, out: tuple[int, int]) -> None:
     image, depth = torch.zeros(100, 3, 50, 50), torch.ones(100, 1, 50, 50)
     frame = torch.ones(50, 50, dtype=torch.bool)
     frame[2:-2, 2:-2] = False
     image[:, :, frame], depth[:, :, frame] = 1.0, 100.0
-    moved, moved_depth = run(Augmentation(**options), image, depth)
-    assert moved.max() < 1e-4
+    moved, moved_depth = run(Augmentation(border=border, **options), image, depth, size=out)
+    assert moved.max() == 0
     assert moved_depth.max() <= 1
+
+
+def test_what_is_within_the_border_is_all_seen() -> None:
+    image, depth = pair(size=(50, 40))
+    moved, moved_depth = run(Augmentation(border=0.1), image, depth, size=(40, 32))
+    torch.testing.assert_close(moved, image[..., 5:-5, 4:-4])
+    assert moved_depth.equal(depth[..., 5:-5, 4:-4])
 
 
 # --- what cannot be -------------------------------------------------------------------------------------------
