@@ -30,6 +30,7 @@ EXAMPLES = {
     "train": (
         ("hudepth-train +experiment=demo", "a first model, in minutes, on built-in rooms"),
         ("hudepth-train +experiment=badcl data=nyu_labeled data.root=nyu", "the paper's recipe on real NYU depth"),
+        ("hudepth-train +experiment=finetune data=folder data.root=mine", "go on from checkpoint=nyu, on your images"),
         ("hudepth-train loss=silog optim.lr=3e-4 trainer.max_epochs=10", "other parts, other values"),
         ("hudepth-train -m loss=badcl,l1,silog seed=1,2,3", "every combination, one run each"),
         ("hudepth-train +sweep=loss_terms seed=1,2 sweep_dir=terms", "an ablation; typed again, it goes on"),
