@@ -253,7 +253,8 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        # torch says itself which build it is (+cpu, +cu130); its package's version need not
+        "packages": {**{name: _version(name) for name in PACKAGES}, "torch": str(torch.__version__)},
         "git": _git(),
         "accelerator": accelerator,
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else _processor(),
