@@ -67,7 +67,7 @@ class Sweep(Sweeper):
         Raises:
             HudepthError: if nothing can run, or after all, if a job failed.
         """
-        self._check_launcher()
+        self._check_slurm()
         folder = self._folder()
         parser = OverridesParser.create(config_loader=self.context.config_loader)
         typed = parser.parse_overrides(list(arguments))
@@ -171,7 +171,7 @@ class Sweep(Sweeper):
         )
         return launcher
 
-    def _check_launcher(self) -> None:
+    def _check_slurm(self) -> None:
         target = str(self.master.hydra.launcher._target_)
         if target.endswith("SlurmLauncher") and shutil.which("srun") is None:
             raise ConfigError(
