@@ -15,8 +15,9 @@ from pathlib import Path
 
 from publish import copy_run, hide
 
-from hudepth.files import write_between
-from hudepth.viz.curves import read_history, save_curves
+from hudepth.base.files import write_between
+from hudepth.report.curves import save_curves
+from hudepth.runs.history import read_history
 
 SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")
 

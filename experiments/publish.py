@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hudepth.files import write_between, write_text
+from hudepth.base.files import write_between, write_text
 
 SHOWN = ("abs_rel", "rmse", "ssim", "delta1", "edge_f1_0.25")
 PLACES = {"abs_rel": 4, "rmse": 3, "ssim": 4, "delta1": 3, "edge_f1_0.25": 3}

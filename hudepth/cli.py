@@ -5,24 +5,16 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
-from hudepth.errors import ConfigError, HudepthError, did_you_mean
+from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.verbs import COMMANDS, VERBS
+from hudepth.base.wording import LAUNCHERS, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
 """Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
-
-VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "sweep", "figures", "paper")}
-"""The first word after the console scripts that can do several things."""
-
-LAUNCHERS = {
-    "joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "submitit": "slurm", "ray": "ray",
-}  # fmt: skip
-"""Ways to run the jobs of a sweep, and the extra of this package that installs each."""
 
 
 def train() -> int:
@@ -155,12 +147,12 @@ def _run_hydra(task: str) -> int:
 
     def job(cfg: Any) -> Any:  # pickled by launchers that run jobs in other processes
         if task == "train" and HydraConfig.get().mode == RunMode.MULTIRUN:
-            return importlib.import_module("hudepth.tasks.job").run_job(cfg)
-        from hudepth.console import setup_logging
+            return importlib.import_module("hudepth.sweep.job").run_job(cfg)
+        from hudepth.base.console import setup_logging
 
         setup_logging()
         try:
-            run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.tasks.{task}"), task)
+            run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.{COMMANDS[task]}.command"), task)
             return run(cfg)
         except Exception as error:  # kept from Hydra, which would print it in its own way
             errors.append(error)
@@ -172,95 +164,3 @@ def _run_hydra(task: str) -> int:
     if errors:
         raise errors[-1]
     return 0
-
-
-def one_line(error: BaseException, task: str) -> str:
-    """Say an error in one line that names the mend.
-
-    Args:
-        error: whatever was raised.
-        task: whose configuration names are suggested.
-    """
-    chain = list(_chain(error))
-    for cause in chain:
-        if isinstance(cause, HudepthError):
-            return " ".join(str(cause).split())
-    for cause in chain:
-        if line := _config_line(cause, task):
-            return line
-    message = " ".join(str(error).split()) or type(error).__name__
-    return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
-
-
-def _config_line(error: BaseException, task: str) -> str | None:
-    """Word the errors of Hydra and OmegaConf, with suggestions."""
-    module = type(error).__module__.partition(".")[0]
-    if module not in ("hydra", "omegaconf", "antlr4"):
-        return None
-    text = str(error)
-    if found := re.search(r"Could not find '([^']+)'", text):
-        group, _, name = found[1].rpartition("/")
-        options = options_of(group)
-        if options:
-            options += [each for each in (*LAUNCHERS, "basic") if group == "hydra/launcher" and each not in options]
-            return f"{group}: no '{name}'.{did_you_mean(name, options)} Pass one of {', '.join(options)}."
-    if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
-        key = found[1] or getattr(error, "full_key", None) or found[2]
-        plus = (
-            f" Further arguments of lightning.Trainer take a plus: +{key}=<value>."
-            if key.startswith("trainer.")
-            else ""
-        )
-        known = known_keys(task)
-        hint = "" if key in known else did_you_mean(key, known)  # a group, but of another task
-        return f"no key '{key}'.{hint} See hudepth-{task} --cfg job for all keys.{plus}"
-    if "Override" in type(error).__name__ or module == "antlr4" or "NoViableAlt" in text:
-        typed = getattr(error, "override", None) or text.split(": ", 1)[-1]
-        return f"cannot read '{typed}': write key=value, and quote values with special characters: 'key=\"a, b\"'."
-    return " ".join(text.split())
-
-
-def conf_folder() -> Path:
-    """Return the folder of the configuration tree."""
-    import hudepth.conf
-
-    return Path(str(hudepth.conf.__file__)).parent
-
-
-def options_of(group: str) -> list[str]:
-    """Return the choices of a group of the configuration, for example ``data``."""
-    return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml") if path.stem != "base")
-
-
-def known_keys(task: str) -> list[str]:
-    """Return all dotted keys and groups of the task's configuration, with the groups chosen on the command line."""
-    from hydra import compose, initialize_config_module
-    from hydra.core.global_hydra import GlobalHydra
-    from omegaconf import OmegaConf
-
-    GlobalHydra.instance().clear()
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
-        try:
-            config = compose(task, overrides=_chosen_groups())
-        except Exception:  # a group chosen that this task does not have, which may be the very mistake
-            config = compose(task)
-    keys = list(_dotted(OmegaConf.to_container(config, resolve=False)))
-    return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
-
-
-def _chosen_groups() -> list[str]:
-    pairs = [argument.partition("=") for argument in sys.argv[1:]]
-    return [f"{group}={name}" for group, _, name in pairs if name in options_of(group.lstrip("+"))]
-
-
-def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
-    for key, value in config.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, dict):
-            yield from _dotted(value, f"{prefix}{key}.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hudepth.cli import conf_folder, options_of
+from hudepth.base.verbs import conf_folder, options_of
 
 ABOUT = {
     "train": "Train a monocular depth model and test its best checkpoint. All goes to runs/<name>/<date_time>/.",

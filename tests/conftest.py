@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import jaxtyping
 import pytest
 import torch
 from hypothesis import settings
+
+from tests.commands import TINY, Command, Result, script
 
 # pep484_tower: an int is welcome where a float is asked for, as in any YAML file
 jaxtyping.install_import_hook("hudepth", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
@@ -38,3 +41,40 @@ def _own_logging(monkeypatch: pytest.MonkeyPatch) -> None:
     log = logging.getLogger("hudepth")
     monkeypatch.setattr(log, "handlers", list(log.handlers))
     monkeypatch.setattr(log, "propagate", log.propagate)
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder of depth stores for all tests, so that rooms are rendered once."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def command(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """Return a function that runs a console script's function in this process, in an empty folder."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    from hudepth import cli
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HUDEPTH_CACHE", str(cache))
+
+    def run(task: str, *arguments: str) -> Result:
+        GlobalHydra.instance().clear()
+        monkeypatch.setattr(sys, "argv", [f"hudepth-{task}", *arguments])
+        capfd.readouterr()
+        code = getattr(cli, task)()
+        captured = capfd.readouterr()
+        return Result(code, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    """A run directory of a finished two-epoch run, made by the installed script from a folder of its own."""
+    folder = tmp_path_factory.mktemp("trained")
+    done = subprocess.run(**script("train", *TINY, "name=tiny", cwd=folder, cache=cache), check=False)
+    assert done.returncode == 0, done.stdout
+    (run,) = (folder / "runs" / "tiny").iterdir()
+    return run

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from hudepth import cli
-from hudepth.errors import ConfigError
+from hudepth.base import wording
+from hudepth.base.errors import ConfigError
 
 BIN = Path(sys.executable).parent
 
@@ -125,4 +126,4 @@ def test_rewrite_refuses_an_unknown_verb() -> None:
 
 
 def test_an_unforeseen_error_is_one_line_too() -> None:
-    assert cli.one_line(KeyError("x"), "train") == "KeyError: 'x' (debug=true shows the traceback)"
+    assert wording.one_line(KeyError("x"), "train") == "KeyError: 'x' (debug=true shows the traceback)"

@@ -11,8 +11,8 @@ from types import ModuleType
 
 import pytest
 
-from hudepth.results import find_result
-from hudepth.viz.curves import read_history
+from hudepth.runs.history import read_history
+from hudepth.runs.results import find_result
 
 STUDIES = Path(__file__).parents[1] / "experiments"
 

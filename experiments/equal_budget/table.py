@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from publish import copy_run, hide
 
-from hudepth.files import write_between
+from hudepth.base.files import write_between
 
 HERE = Path(__file__).parent
 RUNS = ("badcl", "strong")

@@ -11,7 +11,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from hudepth.files import write_between
+from hudepth.base.files import write_between
 
 ROOT = Path(__file__).parents[2]
 KEPT = ("bench.md", "bench.csv", "bench.png", "bench.json")

@@ -19,7 +19,8 @@ from pathlib import Path
 import cv2
 import torch
 
-from hudepth.console import setup_logging
+from hudepth.base.console import setup_logging
+from hudepth.base.machine import usable_cores
 from hudepth.inference.backends import TorchBackend
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.info import ModelInfo
@@ -27,7 +28,6 @@ from hudepth.inference.inputs import find_inputs
 from hudepth.inference.model import DepthModel
 from hudepth.inference.stream import Stream, Tally
 from hudepth.inference.writing import Style, write_depth
-from hudepth.machine import usable_cores
 from hudepth.models import HybridUNet
 from hudepth.models.inference import inference_form
 

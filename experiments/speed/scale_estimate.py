@@ -32,7 +32,7 @@ def gflop_per_image() -> float:
     import torch
 
     from hudepth.models import HybridUNet
-    from hudepth.paper.cost import counted_flops
+    from hudepth.models.cost import counted_flops
 
     with torch.device("meta"):
         return counted_flops(HybridUNet(arithmetic="merged"), torch.empty(1, 3, 224, 224)) / 1e9
@@ -89,6 +89,6 @@ def _hours(ends: list[float]) -> str:
 
 
 if __name__ == "__main__":
-    from hudepth.files import write_between
+    from hudepth.base.files import write_between
 
     write_between(PAGE, "estimate", estimate())

@@ -25,13 +25,13 @@ import yaml
 from lightning.pytorch import Trainer
 from torch import nn
 
-from hudepth.baselines import trivial_baselines
 from hudepth.data.datamodule import DepthDataModule, preprocess
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.sources.rooms import RoomsSource
-from hudepth.evaluation import Evaluation
+from hudepth.evaluation.baselines import trivial_baselines
+from hudepth.evaluation.routine import Evaluation
+from hudepth.evaluation.scoring import BatchScores, BatchTruth
 from hudepth.metrics.protocol import Protocol
-from hudepth.metrics.scoring import BatchScores, BatchTruth
 from hudepth.models import HybridUNet
 
 NAMES = ("paper", "eigen", "eigen_flip", "densedepth", "guided", "raw_holes")

@@ -25,15 +25,16 @@ from hydra import compose, initialize_config_module
 from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import OmegaConf
 
+from hudepth.base.devices import without_known_warnings
+from hudepth.base.instantiate import instantiate
+from hudepth.base.machine import keep_freed_memory
+from hudepth.base.types import Batch
+from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule, preprocess
-from hudepth.instantiate import instantiate
-from hudepth.machine import keep_freed_memory
-from hudepth.module import DepthModule
-from hudepth.tasks.checks import MEMORY_FORMATS
-from hudepth.tasks.common import build_data, without_known_warnings
-from hudepth.tasks.train import build_module
-from hudepth.tasks.trainer import build_callbacks, build_run_trainer
-from hudepth.types import Batch
+from hudepth.training.checks import MEMORY_FORMATS
+from hudepth.training.fit import build_module
+from hudepth.training.module import DepthModule
+from hudepth.training.trainer import build_callbacks, build_run_trainer
 
 
 def read_config(options: argparse.Namespace) -> dict[str, Any]:

@@ -56,8 +56,8 @@ def serve(batch: int) -> None:
     """Be one variant: read options, then run as many steps as each further line says, and answer with their seconds."""
     import torch
 
+    from hudepth.base.machine import keep_freed_memory
     from hudepth.losses import BADCL
-    from hudepth.machine import keep_freed_memory
     from hudepth.models import HybridUNet
 
     options = json.loads(sys.stdin.readline())

@@ -14,9 +14,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from publish import copy_run, hide
 
-from hudepth.files import write_between
-from hudepth.times import read_times
-from hudepth.viz.curves import read_history
+from hudepth.base.files import write_between
+from hudepth.runs.history import read_history
+from hudepth.training.times import read_times
 
 HERE = Path(__file__).parent
 RUNS = ("badcl", "strong")

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hudepth.console import track
+from hudepth.base.console import track
 from hudepth.data.encoding import to_metres
 from hudepth.data.sources.manifest import NyuLabeledSource
 

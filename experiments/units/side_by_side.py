@@ -11,10 +11,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from hudepth.files import write_between
-from hudepth.paper import tables
-from hudepth.results import Result, find_result
-from hudepth.viz.curves import read_history
+from experiments.ledger import tables
+from hudepth.base.files import write_between
+from hudepth.runs.history import read_history
+from hudepth.runs.results import Result, find_result
 
 METRICS = ("ssim", "abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")
 

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from hudepth.data.resize import resize_image
+from hudepth.base.files import written_whole
+from hudepth.base.images import resize_image
+from hudepth.base.normalise import NormaliseBytes
 from hudepth.data.sources.rooms import RoomsSource
-from hudepth.files import written_whole
-from hudepth.normalise import NormaliseBytes
 
 COUNT = 8
 

@@ -9,8 +9,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.base.console import log
 from hudepth.bench.worker import Begun, ContenderError
-from hudepth.console import log
 
 
 @runtime_checkable

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from hudepth.base.instantiate import instantiate
 from hudepth.bench.worker import Spec
-from hudepth.instantiate import instantiate
+from hudepth.models.cost import counted_flops
 from hudepth.models.inference import inference_form
-from hudepth.paper.cost import counted_flops
 
 MATRIX, PRODUCTS = 2048, 3
 """Side of the matrices whose product is the machine's measure, and how many products are timed."""

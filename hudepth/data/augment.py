@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.losses.badcl import BT601_LUMA
 
 MAX_BLUR = 3.0

@@ -16,6 +16,9 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.data import DataLoader, DistributedSampler, Sampler
 
+from hudepth.base.errors import ConfigError
+from hudepth.base.normalise import normalise_image
+from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation, resize
 from hudepth.data.dataset import BlockShuffle, ShardSampler, StoreDataset, as_is
 from hudepth.data.prepare import prepare
@@ -24,9 +27,6 @@ from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split, check_split, make_split
 from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
-from hudepth.errors import ConfigError
-from hudepth.normalise import normalise_image
-from hudepth.types import Batch, RawBatch
 
 
 class DepthDataModule(LightningDataModule):

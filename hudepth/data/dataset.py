@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, Sampler
 
+from hudepth.base.types import RawBatch
 from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
-from hudepth.types import RawBatch
 
 
 class StoreDataset(Dataset[RawBatch]):

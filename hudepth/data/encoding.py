@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.errors import ConfigError, DataError, did_you_mean
 
 ENCODINGS = ("auto", "uint16_mm", "uint8_10m", "float_m", "linear", "paper_literal")
 """What ``data.encoding`` can be; :func:`to_metres` says what each means."""

@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.base.errors import DataError
+from hudepth.base.images import resize_image
+from hudepth.base.machine import usable_cores
 from hudepth.data.encoding import to_metres
-from hudepth.data.resize import resize_image
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.store import to_mm
-from hudepth.errors import DataError
-from hudepth.machine import usable_cores
 
 POOL_FROM = 32
 """Fewer pairs than this are prepared in this process: starting others would take longer."""

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from hudepth.console import log, track
+from hudepth.base.console import log, track
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.files import written_whole
 from hudepth.data.encoding import check_range
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.store import VERSION, DepthStore, StoreWriter
-from hudepth.errors import ConfigError, DataError
-from hudepth.files import written_whole
 
 MAX_SIZES = 16
 """Sizes of images that a store names, of a set that has many."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 
 
 @dataclass(frozen=True)

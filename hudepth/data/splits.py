@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
+from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.files import write_json
 from hudepth.data.sources.base import Record
-from hudepth.errors import ConfigError, DataError, did_you_mean
-from hudepth.files import write_json
 
 SUBSETS = ("train", "val", "test")
 

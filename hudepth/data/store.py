@@ -31,9 +31,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess
-from hudepth.errors import DataError
 
 FORMAT = "hudepth-depth-store"
 VERSION = 1
@@ -66,7 +66,7 @@ def _plain_os_errors() -> Iterator[None]:
 
 
 class StoreWriter:
-    """Writes a depth store pair by pair. Use it inside :func:`hudepth.files.written_whole`.
+    """Writes a depth store pair by pair. Use it inside :func:`hudepth.base.files.written_whole`.
 
     Args:
         path: the file, overwritten.

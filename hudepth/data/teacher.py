@@ -13,13 +13,13 @@ import numpy as np
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from hudepth.console import track
+from hudepth.base.console import track
+from hudepth.base.errors import DataError
+from hudepth.base.files import written_whole
 from hudepth.data.prepare import MAX_SIZES
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess, read_depth
 from hudepth.data.store import DepthStore
-from hudepth.errors import DataError
-from hudepth.files import written_whole
 
 ENDINGS = (".npy", ".png", "_depth.npy", "_depth.png")
 """What follows a pair's id in the name of its teacher's depth; the last two are what ``hudepth-predict`` writes."""

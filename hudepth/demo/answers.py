@@ -16,15 +16,13 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 from PIL import Image
 
-from hudepth.data.resize import resize_image
-from hudepth.data.sources.files import MAX_PIXELS
+from hudepth.base.camera import Intrinsics
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.images import FORMATS, MAX_PIXELS, read_photo, resize_image
 from hudepth.data.store import to_mm
-from hudepth.errors import ConfigError, DataError
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.images import FORMATS, read_photo
 from hudepth.inference.model import DepthModel
 from hudepth.viz.colour import colour_depth
-from hudepth.viz.point_cloud import Intrinsics
 
 MAX_SIDE = 640
 """Of the map that goes to the browser [pixels]: more than any network here tells apart, and less than a megabyte."""

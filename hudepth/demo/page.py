@@ -12,10 +12,10 @@ from typing import Any
 import gradio as gr
 from gradio.data_classes import ImageData
 
-from hudepth.console import log
+from hudepth.base.console import log
+from hudepth.base.errors import HudepthError
 from hudepth.demo.answers import Answer, colour_table
 from hudepth.demo.files import Files
-from hudepth.errors import HudepthError
 from hudepth.inference.info import ModelInfo
 
 FONTS = ["ui-sans-serif", "system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "Arial", "sans-serif"]

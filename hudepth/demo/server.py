@@ -16,9 +16,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from hudepth.base.errors import ConfigError
 from hudepth.demo.answers import Answer, Limits
 from hudepth.demo.files import Files, draw_examples
-from hudepth.errors import ConfigError
 from hudepth.inference.info import ModelInfo
 
 SILENCE = {

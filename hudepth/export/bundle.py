@@ -1,4 +1,4 @@
-"""Write a bundle; :mod:`hudepth.bundles` says what one is and reads it."""
+"""Write a bundle; :mod:`hudepth.runs.bundles` says what one is and reads it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from hudepth import __version__
-from hudepth.bundles import CARD, CONFIG, KIND, ONNX, WEIGHTS
-from hudepth.checkpoint import VERSION, Checkpoint
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.info import ModelInfo
 from hudepth.inference.writing import jpeg
+from hudepth.runs.bundles import CARD, CONFIG, KIND, ONNX, WEIGHTS
+from hudepth.runs.checkpoint import VERSION, Checkpoint
 
 PLACES = ("root", "cache")
 """Keys of ``data`` that say where things lie on the machine of the training, which is nobody else's business."""

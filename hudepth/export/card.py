@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from hudepth import __version__
-from hudepth.checkpoint import Checkpoint
 from hudepth.inference.info import ModelInfo
+from hudepth.runs.checkpoint import Checkpoint
 
 SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")
 UNITS = {"rmse": " [m]"}

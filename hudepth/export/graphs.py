@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hudepth import __version__
-from hudepth.files import written_whole
+from hudepth.base.files import written_whole
 from hudepth.inference.info import KEY, ModelInfo
 from hudepth.inference.pipeline import DepthPipeline
 from hudepth.inference.runtimes import package

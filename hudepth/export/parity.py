@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.errors import CheckpointError
+from hudepth.base.errors import CheckpointError
 from hudepth.inference.backends import Backend
 
 

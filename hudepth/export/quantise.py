@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.export.graphs import openvino, save_openvino
 from hudepth.inference.info import ModelInfo
 from hudepth.inference.runtimes import package

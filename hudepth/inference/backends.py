@@ -14,13 +14,13 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import nn
 
-from hudepth.checkpoint import Checkpoint
-from hudepth.errors import CheckpointError, ConfigError, did_you_mean
+from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
+from hudepth.base.normalise import NormaliseBytes
 from hudepth.inference.info import KEY, ModelInfo
 from hudepth.inference.pipeline import DepthPipeline
 from hudepth.inference.runtimes import PRECISIONS, onnx_session, openvino_model
 from hudepth.models.inference import inference_form
-from hudepth.normalise import NormaliseBytes
+from hudepth.runs.checkpoint import Checkpoint
 
 EXPORTED = {".onnx": "onnxruntime", ".xml": "openvino", ".pt2": "torch"}
 """Exported files, and the backend that reads each wherever its package is installed."""

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hudepth.base.camera import Intrinsics
 from hudepth.data.store import to_mm
 from hudepth.viz.colour import colour_depth
-from hudepth.viz.point_cloud import Intrinsics, PointCloud, point_cloud
+from hudepth.viz.point_cloud import PointCloud, point_cloud
 
 FAST_PNG = (
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hudepth.data.resize import resize_image
-from hudepth.errors import ConfigError, did_you_mean
-from hudepth.normalise import IMAGENET_MEAN
+from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.images import resize_image
+from hudepth.base.normalise import IMAGENET_MEAN
 
 FITS = ("stretch", "letterbox")
 """``stretch`` gives the whole image the network's size, as in training. ``letterbox`` first pads it with grey to the

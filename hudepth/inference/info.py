@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from hudepth.errors import CheckpointError
+from hudepth.base.errors import CheckpointError
 
 VERSION = 1
 """Of the description; exported files carry it as JSON under the key :data:`KEY`."""

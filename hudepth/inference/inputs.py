@@ -7,8 +7,8 @@ from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
-from hudepth.errors import DataError
-from hudepth.inference.images import SUFFIXES
+from hudepth.base.errors import DataError
+from hudepth.base.images import SUFFIXES
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 """Extensions of videos, in lower case."""

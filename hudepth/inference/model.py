@@ -12,14 +12,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from PIL import Image
 
-from hudepth.checkpoint import load_checkpoint
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
+from hudepth.base.images import Photo, as_rgb, read_photo
+from hudepth.base.machine import usable_cores
 from hudepth.inference.backends import EXPORTED, Backend, check_backend, open_exported, torch_backend
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.fit import Fitted, check_fit, fit_image, unfit_depth
-from hudepth.inference.images import Photo, as_rgb, read_photo
 from hudepth.inference.info import ModelInfo
-from hudepth.machine import usable_cores
+from hudepth.runs.checkpoint import load_checkpoint
 
 Picture = str | Path | bytes | NDArray[Any] | Image.Image
 """An image: a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), or a Pillow image."""

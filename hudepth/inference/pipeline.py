@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from hudepth.normalise import NormaliseBytes
+from hudepth.base.normalise import NormaliseBytes
 
 
 class DepthPipeline(nn.Module):

@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 
 PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
 """In which OpenVINO computes, and its own names of them; bfloat16 is not exact."""

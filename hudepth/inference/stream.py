@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel, Picture, Prepared
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.data.sources.files import check_pixels
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
+from hudepth.base.images import check_pixels
 
 # FFmpeg may open files and nothing else, whatever a playlist says, and does not talk; OpenCV looks when it opens one.
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")

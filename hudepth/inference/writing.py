@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.files import written_whole
+from hudepth.base.camera import Intrinsics
+from hudepth.base.files import written_whole
 from hudepth.inference.depth_map import DepthMap
-from hudepth.viz.point_cloud import Intrinsics
 
 JPEG_QUALITY = 92
 

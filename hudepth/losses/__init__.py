@@ -1,4 +1,4 @@
-"""Training losses: all take (pred, target, image, valid) and return :class:`hudepth.types.LossTerms`."""
+"""Training losses: all take (pred, target, image, valid) and return :class:`hudepth.base.types.LossTerms`."""
 
 from __future__ import annotations
 

@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError, did_you_mean
-from hudepth.masked import full_precision, masked_mean, masked_sum
-from hudepth.normalise import denormalise_image
-from hudepth.types import LossTerms
+from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.masked import full_precision, masked_mean, masked_sum
+from hudepth.base.normalise import denormalise_image
+from hudepth.base.types import LossTerms
 
 CHOICES = {
     "boundary_sign": ("plus", "minus"),

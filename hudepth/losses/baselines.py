@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
-from hudepth.masked import full_precision, masked_mean
-from hudepth.types import LossTerms
+from hudepth.base.errors import ConfigError
+from hudepth.base.masked import full_precision, masked_mean
+from hudepth.base.types import LossTerms
 
 MIN_UNIT_DEPTH = 1e-3
 """Depths below this count as this under a logarithm: 1 cm where the unit is 10 m."""

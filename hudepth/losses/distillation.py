@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.masked import full_precision, masked_mean, masked_sum
 from hudepth.losses.baselines import MIN_UNIT_DEPTH, log_difference
-from hudepth.masked import full_precision, masked_mean, masked_sum
 
 KINDS = ("metric", "affine_depth", "affine_inverse")
 """What a teacher's numbers are: metres; depth, or inverse depth (disparity), up to scale and shift."""

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
+from hudepth.base.masked import masked_mean
 from hudepth.losses.baselines import SingleTermLoss, log_difference
-from hudepth.masked import masked_mean
 
 
 def gradient_matching_loss(

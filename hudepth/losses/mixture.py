@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
-from hudepth.types import LossTerms
+from hudepth.base.errors import ConfigError
+from hudepth.base.types import LossTerms
 
 
 class Mixture(nn.Module):

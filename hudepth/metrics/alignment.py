@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hudepth.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, did_you_mean
 
 ALIGNMENTS = ("none", "median", "least_squares", "affine_inverse")
 

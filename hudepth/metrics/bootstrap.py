@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 from hudepth.metrics.student import student_quantile
 from hudepth.metrics.summary import Floats, ImageTable, additive, metrics_from_sums, summarise
 

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hudepth.masked import full_precision
+from hudepth.base.masked import full_precision
 from hudepth.metrics.depth import MIN_DEPTH_M
 
 EDGE_THRESHOLDS = (0.25, 0.5, 1)

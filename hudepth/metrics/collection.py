@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
 
-from hudepth.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.metrics.depth import METRIC_NAMES, SUM_NAMES, depth_metrics_from_sums, depth_sums
 from hudepth.metrics.ssim import ssim_sums
 

@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from hudepth.masked import full_precision
+from hudepth.base.masked import full_precision
 
 MIN_DEPTH_M = 1e-3
 """Predictions below this [m] count as this in logarithms and ratios."""

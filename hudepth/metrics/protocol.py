@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hudepth.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.metrics.alignment import ALIGNMENTS
 from hudepth.metrics.collection import AVERAGINGS
 

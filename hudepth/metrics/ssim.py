@@ -19,8 +19,8 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from hudepth.errors import ConfigError
-from hudepth.masked import full_precision, masked_sum
+from hudepth.base.errors import ConfigError
+from hudepth.base.masked import full_precision, masked_sum
 
 
 def ssim_map(

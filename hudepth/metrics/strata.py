@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float64, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hudepth.masked import full_precision
+from hudepth.base.masked import full_precision
 from hudepth.metrics.depth import DELTAS, MIN_DEPTH_M
 
 DEPTH_EDGES_M = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)

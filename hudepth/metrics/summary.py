@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 
 Floats = NDArray[np.float64]
 

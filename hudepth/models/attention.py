@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.models.options import ACTIVATIONS, choose
 
 POSITIONS = ("none", "sine")

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.models.attention import TransformerBlock
 from hudepth.models.decoder import ARITHMETIC, Arithmetic, UpBlock, UpsampleMode, is_usual_head, joint_head, run_head
 from hudepth.models.options import OUTPUTS, choose

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from hudepth.console import log
+from hudepth.base.console import log
 from hudepth.models.decoder import UpBlock, is_usual_head, joint_head, run_head, split_kernel
 
 TOLERANCE = 1e-5

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, did_you_mean
 
 T = TypeVar("T")
 

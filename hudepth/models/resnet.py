@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.console import log
-from hudepth.errors import CheckpointError, did_you_mean
+from hudepth.base.console import log
+from hudepth.base.errors import CheckpointError, did_you_mean
 from hudepth.models.options import choose
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.models.attention import TransformerBlock
 from hudepth.models.decoder import UpBlock, UpsampleMode
 from hudepth.models.hybrid_unet import check_size

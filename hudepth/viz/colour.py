@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 
 UNMEASURED_GREY = 191
 """Where depth is 0: a light grey that the scale does not contain."""

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from hudepth.files import written_whole
+from hudepth.base.files import written_whole
 
 DEPTH_COLOURS = "turbo_r"
 """Near is red, far is blue."""

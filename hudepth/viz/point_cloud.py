@@ -7,34 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hudepth.data.sources.raycast import nyu_intrinsics
-from hudepth.errors import ConfigError
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera without distortion."""
-
-    fx: float
-    """Focal length [pixels]."""
-    fy: float
-    cx: float
-    """Principal point [pixels], from the centre of the first pixel."""
-    cy: float
-    known: bool = True
-    """False where NYU's camera stands in for one that nobody stated."""
-
-    def __post_init__(self) -> None:
-        if not (0 < self.fx < np.inf and 0 < self.fy < np.inf and np.isfinite(self.cx) and np.isfinite(self.cy)):
-            raise ConfigError(
-                f"intrinsics: [{self.fx},{self.fy},{self.cx},{self.cy}] is no camera. "
-                "Pass intrinsics=[fx,fy,cx,cy] in pixels of the image."
-            )
-
-    @classmethod
-    def of_nyu(cls, height: int, width: int) -> Intrinsics:
-        """Return those of NYU's camera, scaled to another size."""
-        return cls(*nyu_intrinsics(height, width), known=False)
+from hudepth.base.camera import Intrinsics
 
 
 @dataclass(frozen=True)

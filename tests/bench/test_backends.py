@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
+from hudepth.base.errors import ConfigError
 from hudepth.bench import field as module
 from hudepth.bench.backends import BACKENDS, GRAPHS, PRODUCT, check_backends, missing
 from hudepth.bench.field import Field, Subject
 from hudepth.bench.worker import ContenderError, Spec, Worker
-from hudepth.errors import ConfigError
 
 
 def test_the_reference_is_always_there_and_the_order_is_the_tables() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hudepth import machine
+from hudepth.base import machine
 
 X86 = """processor\t: 0
 model name\t: Some CPU @ 2 GHz
@@ -55,7 +55,7 @@ def test_other_systems_have_no_such_file(tmp_path: Path, monkeypatch: pytest.Mon
 FAULTS = """
 import resource, sys
 import numpy as np
-from hudepth.machine import keep_freed_memory
+from hudepth.base.machine import keep_freed_memory
 if sys.argv[1] == "keep":
     assert keep_freed_memory()
 counts = []

@@ -10,9 +10,9 @@ from torch import nn
 from hudepth.bench.images import COUNT, images_file
 from hudepth.bench.torch_runners import TorchRunner, channels_last, default, eager, operations, product
 from hudepth.bench.worker import Spec
+from hudepth.models.cost import counted_flops
 from hudepth.models.hybrid_unet import HybridUNet
 from hudepth.models.inference import inference_form
-from hudepth.paper.cost import counted_flops
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from hudepth import cli
-from hudepth.tasks.sweep_jobs import Job, combine
-from hudepth.tasks.sweep_jobs import compose as compose_jobs
+from hudepth.base import verbs
+from hudepth.sweep.jobs import Job, combine
+from hudepth.sweep.jobs import compose as compose_jobs
 
-CONF = cli.conf_folder()
+CONF = verbs.conf_folder()
 FILES = sorted(CONF.rglob("*.yaml"))
 SMALL = (
     "data.size=[32,48]", "data.source.scenes=6", "data.source.frames_per_scene=2", "data.source.size=[48,64]",

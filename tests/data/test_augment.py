@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from hudepth.base.errors import ConfigError
 from hudepth.data.augment import (
     MAX_BLUR,
     Augmentation,
@@ -28,7 +29,6 @@ from hudepth.data.augment import (
     resize,
     warp,
 )
-from hudepth.errors import ConfigError
 
 EVERYTHING: dict[str, Any] = {
     "flip": 0.5, "zoom": (1.0, 2.0), "rotate_deg": 20.0, "border": 0.05, "gamma": (0.5, 2.0), "brightness": (0.5, 1.5),

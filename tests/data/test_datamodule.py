@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.types import Batch, RawBatch
 from hudepth.data.datamodule import DepthDataModule, preprocess
 from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.data.splits import make_split
-from hudepth.errors import ConfigError, DataError
-from hudepth.types import Batch, RawBatch
 
 SIZE, NATIVE = (6, 8), (12, 20)
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.encoding import ENCODINGS, DepthRange, check_range, resolve_encoding, to_metres
-from hudepth.errors import ConfigError, DataError
 
 SHAPES = st.tuples(st.integers(1, 4), st.integers(1, 4))
 UINT8 = arrays(np.uint8, SHAPES)

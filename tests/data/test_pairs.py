@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.pairs import POOL_FROM, PreparedPair, prepare_pair, prepare_pairs, read_metres
 from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.sources.folder import FolderSource
-from hudepth.errors import ConfigError, DataError
 
 
 class MemorySource(Source):

@@ -19,12 +19,12 @@ import h5py
 import numpy as np
 import pytest
 
-from hudepth.console import log
+from hudepth.base.console import log
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.prepare import UNIT_SAMPLES, prepare, store_path
 from hudepth.data.sources.base import RawPair, Record
 from hudepth.data.sources.folder import FolderSource
 from hudepth.data.store import DepthStore
-from hudepth.errors import ConfigError, DataError
 
 SIZE = (6, 8)
 NATIVE = (12, 18)
@@ -397,7 +397,7 @@ import os, resource, signal, sys, time
 from pathlib import Path
 from hudepth.data.prepare import prepare
 from hudepth.data.sources.folder import FolderSource
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 
 class SlowSource(FolderSource):
     def read(self, record):

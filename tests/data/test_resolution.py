@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hudepth.base.errors import ConfigError
 from hudepth.data.resolution import Stage, read_stages, size_at
-from hudepth.errors import ConfigError
 
 SIZE = (224, 288)
 TWO = [Stage((112, 112), 0.5), Stage((160, 160), 0.8)]

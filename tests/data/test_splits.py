@@ -13,9 +13,9 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.sources.base import Record
 from hudepth.data.splits import SUBSETS, Split, load_split, make_split, save_split, split_counts
-from hudepth.errors import ConfigError, DataError
 
 PAPER = (0.7, 0.1, 0.2)
 

@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter, to_mm
-from hudepth.errors import DataError
 
 SIZE = (3, 5)
 

@@ -18,12 +18,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hudepth.base.errors import DataError
 from hudepth.data import teacher
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter
 from hudepth.data.teacher import ENDINGS, TeacherDepths
-from hudepth.errors import DataError
 
 N, SIZE, NATIVE = 5, (4, 6), (8, 12)
 

@@ -12,9 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
-from hudepth.checkpoint import KEY, VERSION
 from hudepth.inference.model import DepthModel, load
 from hudepth.models import TinyUNet
+from hudepth.runs.checkpoint import KEY, VERSION
 
 
 @pytest.fixture(scope="session")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hudepth.base.camera import Intrinsics
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.store import to_mm
 from hudepth.demo.answers import Answer, Limits, answer, colour_table, reduced, scaled
-from hudepth.errors import ConfigError, DataError
 from hudepth.inference.model import DepthModel
 from hudepth.viz.colour import colour_depth
-from hudepth.viz.point_cloud import Intrinsics
 
 from .conftest import HOSTILE, encoded
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from hudepth.base.errors import DataError
 from hudepth.demo.answers import Answer, Limits, answer
 from hudepth.demo.files import Files
-from hudepth.errors import DataError
 from hudepth.inference.info import ModelInfo
 from hudepth.inference.model import DepthModel
 

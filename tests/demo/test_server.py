@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from hudepth.base.errors import ConfigError
 from hudepth.demo.server import POLICY, Policy, free_port
-from hudepth.errors import ConfigError
 
 
 def test_a_port_that_is_taken_is_said_with_the_mend() -> None:

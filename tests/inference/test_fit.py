@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.inference.fit import check_fit, fit_image, unfit_depth
 
 sides = st.integers(1, 90)

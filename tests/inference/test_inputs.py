@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 from hudepth.inference.inputs import find_inputs
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 from hudepth.inference.video import FrameReader, VideoWriter
 
 

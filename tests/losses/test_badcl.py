@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
+from hudepth.base.normalise import normalise_image
 from hudepth.losses import BADCL
 from hudepth.losses.badcl import CHOICES, boundary_weight, forward_difference, scaling_factor, scaling_loss
-from hudepth.normalise import normalise_image
 
 VARIANTS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.losses import L1, L2, BerHu, SILog
 from hudepth.losses.baselines import berhu_loss, silog_loss
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.losses.distillation import KINDS, Distillation, affine_invariant_loss, normalised_by_mean
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.losses.gradients import GradientMatching, gradient_matching_loss
 
 

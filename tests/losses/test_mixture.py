@@ -9,11 +9,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
+from hudepth.base.types import LossTerms
 from hudepth.losses import BADCL, L1, SILog
 from hudepth.losses.gradients import GradientMatching
 from hudepth.losses.mixture import Mixture
-from hudepth.types import LossTerms
 
 
 class Part(nn.Module):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.metrics.alignment import ALIGNMENTS, MAX_DEPTH_M, align
 
 SEEDS = st.integers(0, 1000)

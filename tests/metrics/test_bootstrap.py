@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 from hudepth.metrics.bootstrap import (
     LEVEL,
     bootstrap,

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.utilities import dim_zero_sum
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.metrics.collection import DepthMetrics, DepthSSIM
 from hudepth.metrics.depth import METRIC_NAMES, depth_metrics, depth_metrics_from_sums, depth_sums
 from hudepth.metrics.ssim import ssim

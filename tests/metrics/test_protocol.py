@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.metrics.protocol import Protocol
 
 EIGEN: dict[str, Any] = {

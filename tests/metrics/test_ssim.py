@@ -13,7 +13,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 from torchmetrics.image import StructuralSimilarityIndexMeasure
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.metrics.ssim import gaussian, ssim, ssim_map, window_sum
 
 

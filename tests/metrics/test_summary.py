@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 from hudepth.metrics.depth import METRIC_NAMES, depth_metrics_from_sums, depth_sums
 from hudepth.metrics.summary import (
     DEPTH_NAMES,

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.models import HybridUNet
 
 # Every row of table A1 with a shape: (module here, output without the batch, parameters or None where it states none).

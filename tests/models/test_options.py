@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.models.options import NEAREST_UNIT_DEPTH, OUTPUTS, DepthBins, LogDepth, choose
 
 

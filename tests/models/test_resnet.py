@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hudepth.errors import CheckpointError
+from hudepth.base.errors import CheckpointError
 from hudepth.models.resnet import IMAGENET_URL, BasicBlock, ResNet18Trunk
 
 RESNET = "Pass a ResNet-18 file with torchvision's parameter names"

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from hudepth import cli
-from hudepth.checkpoint import KEY, VERSION, load_checkpoint
-from hudepth.errors import CheckpointError, ConfigError
-from hudepth.instantiate import instantiate
+from hudepth.base import verbs
+from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.instantiate import instantiate
 from hudepth.models import ResNet18UNet
 from hudepth.models.resnet import ResNet18Trunk
+from hudepth.runs.checkpoint import KEY, VERSION, load_checkpoint
 
 CONFIGS = {"resnet18_unet": 0, "hybrid_unet_text": 4}
 """Files of conf/model, and how many transformer layers each has."""
@@ -72,7 +72,7 @@ def count(module: nn.Module) -> int:
 
 
 def configured(name: str) -> dict[str, Any]:
-    return dict(yaml.safe_load((cli.conf_folder() / "model" / f"{name}.yaml").read_text()))
+    return dict(yaml.safe_load((verbs.conf_folder() / "model" / f"{name}.yaml").read_text()))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_configured_networks(name: str, layers: int) -> None:
     built = instantiate(config, only=nn.Module)
     expected = 14_419_841 + layers * transformer(512)
     assert count(built) == expected
-    assert f" {expected:,} parameters." in (cli.conf_folder() / "model" / f"{name}.yaml").read_text()
+    assert f" {expected:,} parameters." in (verbs.conf_folder() / "model" / f"{name}.yaml").read_text()
     assert len(built.attention) == layers
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.models import TinyUNet
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import colormaps
 
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 from hudepth.viz.colour import UNMEASURED_GREY, colour_depth
 
 TURBO = np.array([colormaps["turbo_r"](i / 255)[:3] for i in range(256)]) * 255

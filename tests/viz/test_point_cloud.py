@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.errors import ConfigError
-from hudepth.viz.point_cloud import Intrinsics, point_cloud
+from hudepth.base.camera import Intrinsics
+from hudepth.base.errors import ConfigError
+from hudepth.viz.point_cloud import point_cloud
 
 
 def read_ply(data: bytes) -> tuple[list[str], np.ndarray]:

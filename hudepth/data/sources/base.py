@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 
 
 @dataclass(frozen=True, slots=True)

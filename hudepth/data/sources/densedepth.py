@@ -9,18 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
+from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.images import read_bytes
 from hudepth.data.encoding import check_encoding
 from hudepth.data.sources.base import RawPair, Record, Source, existing_root
-from hudepth.data.sources.files import (
-    PerProcess,
-    csv_rows,
-    make_pair,
-    read_bytes,
-    read_depth,
-    read_image,
-)
+from hudepth.data.sources.files import PerProcess, csv_rows, make_pair, read_depth, read_image
 from hudepth.data.sources.pairing import category_of
-from hudepth.errors import ConfigError, DataError, did_you_mean
 
 MAX_MEMBER_BYTES = 64 << 20
 """Larger members of the zip file are refused before they are decompressed."""

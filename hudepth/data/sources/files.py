@@ -13,14 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.base.errors import DataError
+from hudepth.base.images import check_file, check_pixels, read_bytes
 from hudepth.data.sources.base import RawPair
 from hudepth.data.sources.headers import image_size, is_tiff
-from hudepth.errors import DataError
-
-MAX_PIXELS = 100_000_000
-"""Larger images are refused before they are decoded."""
-MAX_FILE_BYTES = 1 << 30
-"""Larger files are refused before they are read."""
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 """Extensions of images, in lower case."""
@@ -68,19 +64,6 @@ def inside(root: Path, name: str, *, where: str) -> Path:
     if not name or "\0" in name or name.startswith("/") or windows.anchor or ".." in parts:
         raise DataError(f"{where}: path {name!r} is not inside the data folder. Use paths relative to '{root}'.")
     return root / name
-
-
-def read_bytes(path: Path) -> bytes:
-    """Read a whole file of at most :data:`MAX_FILE_BYTES`.
-
-    Raises:
-        DataError: if it is missing, too large or unreadable.
-    """
-    _check_file(path)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"'{path}': cannot be read ({error.strerror}). Check its permissions.") from None
 
 
 def csv_rows(data: bytes, *, where: str) -> list[tuple[int, list[str]]]:
@@ -168,18 +151,6 @@ def read_pair(image: Path, depth: Path) -> RawPair:
     return make_pair(read_image(image), read_depth(depth), image_where=f"'{image}'", depth_where=f"'{depth}'")
 
 
-def check_pixels(height: int, width: int, *, where: str) -> None:
-    """Accept sizes of 1 to :data:`MAX_PIXELS` pixels.
-
-    Raises:
-        DataError: for any other size.
-    """
-    if not 0 < height * width <= MAX_PIXELS:
-        raise DataError(
-            f"{where}: {width} x {height} pixels, allowed are 1 to {MAX_PIXELS // 10**6} million. Resize the file."
-        )
-
-
 def _load(source: Path | bytes, where: str) -> tuple[bytes, str]:
     if isinstance(source, bytes):
         return source, where or "image data"
@@ -199,7 +170,7 @@ def _decode(data: bytes, flags: int, where: str) -> NDArray[Any]:
 
 
 def _read_npy(path: Path, where: str) -> NDArray[np.generic]:
-    _check_file(path)
+    check_file(path)
     try:  # open_memmap reads the header alone, refuses pickles, and finds files that are cut short
         mapped = np.lib.format.open_memmap(path, mode="r")
     except (ValueError, OSError, OverflowError, TypeError, SyntaxError, EOFError):
@@ -208,10 +179,3 @@ def _read_npy(path: Path, where: str) -> NDArray[np.generic]:
         raise DataError(f"{where}: {mapped.dtype} array of shape {mapped.shape}. Save one number per pixel, as [H, W].")
     check_pixels(*mapped.shape, where=where)
     return np.array(mapped, dtype=mapped.dtype.newbyteorder("="), order="C", subok=False)
-
-
-def _check_file(path: Path) -> None:
-    if not path.is_file():
-        raise DataError(f"no file '{path}'. Copy it there, or take it off the list.")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise DataError(f"'{path}': larger than {MAX_FILE_BYTES >> 20} MiB. It cannot be one depth map or list.")

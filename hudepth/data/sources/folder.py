@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
+from hudepth.base.errors import DataError
 from hudepth.data.encoding import ENCODINGS, check_encoding
 from hudepth.data.sources.base import RawPair, Record, Source, existing_root
 from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inside, read_pair
 from hudepth.data.sources.pairing import add_unique, pair_up, walk_files
-from hudepth.errors import DataError
 
 
 class FolderSource(Source):

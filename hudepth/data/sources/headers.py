@@ -10,7 +10,7 @@ import re
 import struct
 import zlib
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+from hudepth.base.errors import DataError
+from hudepth.base.images import read_bytes
 from hudepth.data.encoding import check_encoding
 from hudepth.data.sources.base import RawPair, Record, Source, existing_root
-from hudepth.data.sources.files import csv_rows, inside, read_bytes, read_pair
-from hudepth.errors import DataError
+from hudepth.data.sources.files import csv_rows, inside, read_pair
 
 _REQUIRED = ("image", "depth")
 _SPLITS = ("", "train", "test")

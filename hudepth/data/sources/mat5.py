@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 
 MAX_BYTES = 64 << 20
 """Larger contents, after decompression, are refused."""

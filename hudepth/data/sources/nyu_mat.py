@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
+from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.images import MAX_PIXELS, check_pixels, read_bytes
 from hudepth.data.encoding import check_encoding
 from hudepth.data.sources.base import RawPair, Record, Source, existing_root
-from hudepth.data.sources.files import MAX_PIXELS, PerProcess, check_pixels, make_pair, read_bytes
+from hudepth.data.sources.files import PerProcess, make_pair
 from hudepth.data.sources.mat5 import read_mat5
 from hudepth.data.sources.pairing import category_of
-from hudepth.errors import ConfigError, DataError, did_you_mean
 
 _FILE = "nyu_depth_v2_labeled.mat"
 _SPLITS = "splits.mat"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
-from hudepth.errors import DataError
+from hudepth.base.errors import DataError
 
 
 def walk_files(root: Path) -> Iterator[PurePosixPath]:

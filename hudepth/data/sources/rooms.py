@@ -10,13 +10,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.base.camera import Intrinsics
+from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.data.rooms.fittings import CATEGORIES
+from hudepth.data.rooms.materials import noise
+from hudepth.data.rooms.raycast import F32, pinhole_view
+from hudepth.data.rooms.scene import VARIETIES, build_room
+from hudepth.data.rooms.shading import render
 from hudepth.data.sources.base import RawPair, Record, Source
-from hudepth.data.sources.raycast import F32, Intrinsics, nyu_intrinsics, pinhole_view
-from hudepth.data.sources.rooms_fittings import CATEGORIES
-from hudepth.data.sources.rooms_materials import noise
-from hudepth.data.sources.rooms_scene import VARIETIES, build_room
-from hudepth.data.sources.rooms_shading import render
-from hudepth.errors import ConfigError, DataError, did_you_mean
 
 RENDERER_VERSION = 1
 """Raise it whenever a change alters any frame: prepared data with another version is out of date."""
@@ -83,7 +84,7 @@ class RoomsSource(Source):
     @property
     def intrinsics(self) -> Intrinsics:
         """The camera: row v, column u at depth z lies at x = (u - cx) z / fx, y = (v - cy) z / fy."""
-        return nyu_intrinsics(*self.size)
+        return Intrinsics.of_nyu(*self.size)
 
     def records(self) -> Sequence[Record]:
         """List all frames, scene by scene; nothing is rendered."""

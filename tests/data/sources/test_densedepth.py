@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.encoding import to_metres
 from hudepth.data.sources import densedepth
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.densedepth import DenseDepthSource
-from hudepth.errors import ConfigError, DataError
 
 _RNG = np.random.default_rng(0)
 RGB = _RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8)

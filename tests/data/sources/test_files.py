@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources.files import PerProcess, csv_rows, inside, make_pair, read_depth, read_image
-from hudepth.errors import DataError
 
 RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 9999, (12, 20), dtype=np.uint16)

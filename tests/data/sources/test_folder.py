@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.folder import FolderSource
-from hudepth.errors import ConfigError, DataError
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).uniform(0.5, 9, (6, 8)).astype(np.float32)

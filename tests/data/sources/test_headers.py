@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources.files import read_depth, read_image
 from hudepth.data.sources.headers import image_size
-from hudepth.errors import DataError
 
 RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 9999, (12, 20), dtype=np.uint16)

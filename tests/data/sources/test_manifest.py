@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.encoding import check_range, to_metres
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.manifest import ManifestSource, NyuLabeledSource
-from hudepth.errors import ConfigError, DataError
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 9999, (6, 8), dtype=np.uint16)

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources import mat5
 from hudepth.data.sources.mat5 import read_mat5
-from hudepth.errors import DataError
 
 DTYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.nyu_mat import NyuMatSource
-from hudepth.errors import ConfigError, DataError
 
 SCENES = ("kitchen_0004", "study_room_0005b", "kitchen_0004")
 _RNG = np.random.default_rng(0)

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.encoding import check_range, to_metres
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.nyu_raw import NyuRawSource
-from hudepth.errors import ConfigError, DataError
 
 RGB = np.full((6, 8, 3), 200, np.uint8)
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8)

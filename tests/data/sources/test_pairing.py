@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources.pairing import add_unique, category_of, natural_key, pair_up, walk_files
-from hudepth.errors import DataError
 
 
 def test_numbers_sort_as_numbers() -> None:

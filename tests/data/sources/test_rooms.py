@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.data.rooms.raycast import BOX, CYLINDER, F64, ROOM_FACES, Solids, View, pinhole_view, trace
+from hudepth.data.rooms.scene import build_room
 from hudepth.data.sources import rooms
-from hudepth.data.sources.raycast import BOX, CYLINDER, F64, ROOM_FACES, Solids, View, pinhole_view, trace
 from hudepth.data.sources.rooms import RoomsSource, kinect_holes
-from hudepth.data.sources.rooms_scene import build_room
-from hudepth.errors import ConfigError, DataError
 
 SMALL = (48, 64)
 
@@ -308,7 +308,7 @@ def test_options_of_the_wrong_type_say_what_to_do() -> None:
     # In a process of its own: in this one, the type checker of the tests speaks first.
     code = """
 from hudepth.data.sources.rooms import RoomsSource
-from hudepth.errors import ConfigError
+from hudepth.base.errors import ConfigError
 for options in ({"scenes": 2.0}, {"seed": None}, {"holes": "no"}, {"size": 240}, {"size": "ab"}, {"size": (24.0, 32)}):
     try:
         RoomsSource(**options)

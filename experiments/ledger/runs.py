@@ -1,0 +1,205 @@
+"""Runs as evidence: what each trained with, how it went, and how it tested."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hudepth.base.errors import ConfigError, HudepthError
+from hudepth.runs.history import read_history
+from hudepth.runs.results import MODEL, flat
+from hudepth.runs.run_dir import is_run, read_config
+
+"""What metrics.json calls the trained network, beside the baselines."""
+INCIDENTAL = (
+    "name", "monitor", "mode", "test", "resume", "trust", "callbacks", "logger", "protocol", "paths", "hydra", "debug",
+    "data.root", "data.cache", "data.num_workers", "data.native", "data.on_error", "data.prepare_workers",
+    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy", "trainer.deterministic",
+    "trainer.max_epochs", "model.weights",
+)  # fmt: skip
+"""Keys in which two runs of one recipe may differ: places, hardware, and how long it ran. Of ``model.weights`` it only
+counts whether there are any."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run directory, or a study's copy of one."""
+
+    path: Path
+    config: Mapping[str, Any]
+    """Flat: dotted keys."""
+    history: list[dict[str, float]]
+    """One row an epoch; empty where metrics.csv cannot be read."""
+    tests: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """metrics.json by protocol."""
+    problems: list[str] = field(default_factory=list)
+    """One line for each file that is missing or damaged."""
+
+    @property
+    def name(self) -> str:
+        """As it was called, with its folder where that says more."""
+        folder = self.path.resolve().name
+        name = str(self.config.get("name", folder))
+        return name if name == folder else f"{name} ({folder})"
+
+    @property
+    def split(self) -> str:
+        """random, scene or official, of the training."""
+        return str(self.config.get("data.split", "unknown"))
+
+    @property
+    def misread(self) -> bool:
+        """Whether it read 8-bit depth as millimetres."""
+        return self.config.get("data.encoding") == "paper_literal"
+
+    @property
+    def loss(self) -> str:
+        """The loss's class, for example ``BADCL``."""
+        return str(self.config.get("loss._target_", "unknown")).rpartition(".")[2]
+
+    @property
+    def training_images(self) -> int | None:
+        """Size of the training subset, None where no test result states it."""
+        for test in self.tests.values():
+            trained_on = _at(test, "checkpoint", "trained_on", "split") or test.get("split")
+            count = _at(trained_on, "counts", "train")
+            if isinstance(count, int):
+                return count
+        return None
+
+    def tested_source(self, protocol: str) -> str:
+        """Return the data set a test was about."""
+        return str(self.tests[protocol].get("data", {}).get("source", "?"))
+
+    def tested_split(self, protocol: str) -> str:
+        """Return the kind of split a test was about."""
+        return str(self.tests[protocol].get("split", {}).get("kind", "?"))
+
+    def metric(self, protocol: str, name: str) -> float | None:
+        """Return a test metric of the trained network, None where there is none."""
+        value = _at(self.tests, protocol, "metrics", MODEL, name)
+        return float(value) if _is_number(value) else None
+
+    def interval(self, protocol: str, name: str) -> tuple[float, float] | None:
+        """Return the interval of a test metric [low, high], None where the result states none."""
+        ends = _at(self.tests, protocol, "intervals", MODEL, name)
+        if isinstance(ends, list) and len(ends) == 2 and all(map(_is_number, ends)):
+            return float(ends[0]), float(ends[1])
+        return None
+
+    def at_epoch(self, epoch: int, key: str) -> float | None:
+        """Return a value of the history at an epoch, None where there is none."""
+        return next((row[key] for row in self.history if row["epoch"] == epoch and key in row), None)
+
+    @property
+    def last_epoch(self) -> int:
+        """0 where there is no history."""
+        return int(max((row["epoch"] for row in self.history), default=0))
+
+
+def find_runs(paths: Sequence[str | Path]) -> list[Run]:
+    """Read the runs at and below some folders.
+
+    Args:
+        paths: run directories, studies, or folders with several of them up to three levels down.
+
+    Raises:
+        ConfigError: if a folder does not exist or holds no run: a slip of the keyboard, found before any work.
+    """
+    folders: dict[Path, Path] = {}  # as typed, each once whatever its spelling
+    for given in paths:
+        path = Path(given).expanduser()
+        if not path.is_dir():
+            raise ConfigError(f"runs: no folder '{path}'. Pass run directories, as runs=[experiments/badcl_official].")
+        found = (
+            [path]
+            if is_run(path)
+            else sorted(p.parent for level in range(1, 4) for p in path.glob(f"{'*/' * level}config.yaml"))
+        )
+        if not found:
+            raise ConfigError(f"runs: '{path}' is no run and holds none: there is no config.yaml at or below it.")
+        folders |= {folder.resolve(): folder for folder in found if folder.resolve() not in folders}
+    return [read_run(folder) for folder in folders.values()]
+
+
+def read_run(path: Path) -> Run:
+    """Read one run directory; what cannot be read becomes a line in ``problems``."""
+    problems: list[str] = []
+    config: dict[str, Any] = {}
+    history: list[dict[str, float]] = []
+    try:
+        config = flat(read_config(path))
+    except HudepthError as error:
+        problems.append(str(error))
+    try:
+        history = read_history(path / "metrics.csv")
+    except HudepthError as error:
+        problems.append(str(error))
+    tests: dict[str, dict[str, Any]] = {}
+    for file in sorted((path / "test").glob("*/metrics.json")):
+        try:
+            tests[file.parent.name] = read_result(file)
+        except ConfigError as error:
+            problems.append(str(error))
+    if not tests:
+        problems.append(f"'{path}' holds no readable test result. Run hudepth-test checkpoint={path} first.")
+    return Run(path, config, history, tests, problems)
+
+
+def read_result(file: Path) -> dict[str, Any]:
+    """Read a metrics.json.
+
+    Raises:
+        ConfigError: if it cannot be read or holds no metrics of the trained network.
+    """
+    again = "Run hudepth-test on that run again."
+    try:
+        result: Any = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"'{file}' cannot be read ({type(error).__name__}). {again}") from error
+    metrics = result.get("metrics") if isinstance(result, dict) else None
+    if not isinstance(metrics, dict) or not isinstance(metrics.get(MODEL), dict):
+        raise ConfigError(f"'{file}' holds no metrics of a model. {again}")
+    for key in ("data", "split", "protocol", "intervals", "checkpoint"):
+        if not isinstance(result.get(key, {}), dict):
+            raise ConfigError(f"'{file}': its '{key}' is no mapping. {again}")
+    return dict(result)
+
+
+def same_but(a: Run, b: Run, *keys: str) -> bool:
+    """Tell whether two runs follow one recipe except in ``keys`` and what lies below them.
+
+    Keys in :data:`INCIDENTAL` may differ too. Runs whose configuration is unknown match nothing.
+    """
+    ignored = (*INCIDENTAL, *keys)
+
+    def recipe(run: Run) -> dict[str, Any]:
+        kept = {k: v for k, v in run.config.items() if not any(k == i or k.startswith(f"{i}.") for i in ignored)}
+        return {**kept, "pretrained": run.config.get("model.weights") not in (None, "none")}
+
+    return bool(a.config) and bool(b.config) and recipe(a) == recipe(b)
+
+
+def pairs(runs: Sequence[Run], *keys: str) -> list[tuple[Run, Run]]:
+    """Return every two runs that are :func:`same_but` for ``keys`` and differ in the first of them."""
+    return [
+        (a, b)
+        for a, b in itertools.combinations(runs, 2)
+        if a.config.get(keys[0]) != b.config.get(keys[0]) and same_but(a, b, *keys)
+    ]
+
+
+def _at(value: object, *keys: str) -> Any:
+    """Look a nested value up, None where there is none."""
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,98 @@
+"""What runs a training or a test: a Trainer on devices that are there, in no more processes than there are pairs."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch import Trainer
+from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
+from lightning.pytorch.utilities import rank_zero_only
+
+from hudepth.base.errors import ConfigError
+
+GPUS = {
+    "gpu": (CUDAAccelerator, MPSAccelerator),
+    "cuda": (CUDAAccelerator,),
+    "mps": (MPSAccelerator,),
+}
+"""Accelerators that a machine may lack, and what each can be."""
+
+
+def check_devices(options: Mapping[str, Any]) -> None:
+    """Check that what ``trainer`` asks for is there, before anything is prepared or written.
+
+    Args:
+        options: the ``trainer`` part of a configuration.
+
+    Raises:
+        ConfigError: for a GPU where there is none, or batch norm over processes where PyTorch has none.
+    """
+    accelerator = str(options.get("accelerator", "auto"))
+    if accelerator in GPUS and not any(kind.is_available() for kind in GPUS[accelerator]):
+        several = str(options.get("devices", 1)) != "1"
+        mend = "trainer.accelerator=cpu" + (" trainer.devices=2, or as many as there are cores" if several else "")
+        raise ConfigError(f"trainer.accelerator={accelerator}: no GPU here. Pass {mend}.")
+    on_cpu = accelerator == "cpu" or (accelerator == "auto" and not any(kind.is_available() for kind in GPUS["gpu"]))
+    if options.get("sync_batchnorm") and on_cpu:
+        raise ConfigError(
+            "trainer.sync_batchnorm: PyTorch has it on GPUs only. Pass trainer.sync_batchnorm=false, and each process "
+            "normalises by its own share of a batch."
+        )
+
+
+def build_trainer(options: Mapping[str, Any], **fixed: Any) -> Trainer:
+    """Build a Trainer.
+
+    Args:
+        options: the ``trainer`` part of a configuration.
+        **fixed: what is not configured.
+
+    Raises:
+        ConfigError: if the devices are not there, or Lightning refuses an option.
+    """
+    check_devices(options)
+    try:
+        return Trainer(**options, **fixed)
+    except (TypeError, ValueError, MisconfigurationException) as error:
+        raise ConfigError(f"trainer: {error}") from error
+
+
+def check_shares(trainer: Trainer, *, subset: str, pairs: int) -> None:
+    """Check that every process has something to score: one without would leave the others waiting.
+
+    Args:
+        trainer: knows the number of processes.
+        subset: ``validation`` or ``test``.
+        pairs: in the subset.
+
+    Raises:
+        ConfigError: if there are fewer pairs than processes.
+    """
+    if pairs < trainer.world_size:
+        raise ConfigError(
+            f"trainer.devices: the {subset} subset has {pairs} pair{'s' * (pairs != 1)} for {trainer.world_size} "
+            f"processes, each of which needs one. Pass trainer.devices={pairs}."
+        )
+
+
+@contextmanager
+def without_known_warnings() -> Iterator[None]:
+    """Hide warnings of the libraries that no user can act upon."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*does not have many workers.*")  # reading a store needs none
+        warnings.filterwarnings("ignore", ".*exists and is not empty.*")  # the run directory, by design
+        warnings.filterwarnings("ignore", ".*LeafSpec.*")  # between Lightning and torch
+        warnings.filterwarnings("ignore", ".*in eval mode at the start.*")  # model.trunk_norm=frozen, by design
+        for name in ("lightning.pytorch", "lightning.fabric"):
+            logging.getLogger(name).setLevel(logging.WARNING)  # their greetings
+        yield
+
+
+def is_first_process() -> bool:
+    """Tell whether this process writes to the run directory: of a distributed run only the first does."""
+    return bool(getattr(rank_zero_only, "rank", 0) == 0)

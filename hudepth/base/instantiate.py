@@ -1,0 +1,95 @@
+"""Turn plain configuration into objects, from trusted modules only.
+
+A configuration may come from a stranger's checkpoint, so a ``_target_`` is not imported unless it lies under a prefix
+on the allow-list, and what it names must be a class that was defined there: ``hudepth.base.files.os.system`` is refused
+although its name starts well.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Iterable, Mapping
+from typing import Any, cast
+
+from hudepth.base.errors import ConfigError, HudepthError, did_you_mean
+
+TRUSTED = ("hudepth.", "torch.nn.", "torch.optim.", "lightning.pytorch.loggers.", "lightning.pytorch.callbacks.")
+"""Prefixes of modules whose classes a configuration may name."""
+
+
+def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type = object, **extra: Any) -> Any:
+    """Build what ``config`` describes.
+
+    Args:
+        config: plain Python: mappings with a ``_target_`` become objects, other mappings, lists and scalars stay.
+        *args: positional arguments of the outermost object, for example an optimiser's parameters.
+        trust: further modules whose classes may be named, for example ``["my_package"]``.
+        only: every class named, also a nested one, must be of this kind: what a stranger's configuration builds where
+            a network is expected should not be something that writes files.
+        **extra: keyword arguments of the outermost object, over those in ``config``.
+
+    Raises:
+        ConfigError: if a target is not trusted, is no such class, or does not take its arguments.
+    """
+    prefixes = (*TRUSTED, *(f"{name.rstrip('.')}." for name in trust))
+    return _build(config, prefixes, only, args, extra)
+
+
+def _build(
+    config: Any, prefixes: tuple[str, ...], only: type, args: tuple[Any, ...] = (), extra: Mapping[str, Any] = {}
+) -> Any:
+    if isinstance(config, list):
+        return [_build(item, prefixes, only) for item in config]
+    if not isinstance(config, Mapping):
+        return config
+    built = {key: _build(value, prefixes, only) for key, value in config.items() if key != "_target_"}
+    if "_target_" not in config:
+        return built
+    target = _locate(str(config["_target_"]), prefixes)
+    if not issubclass(target, only):
+        raise ConfigError(f"_target_: '{config['_target_']}' is no {only.__name__}, which is what belongs here.")
+    arguments = {**built, **extra}
+    try:
+        inspect.signature(target).bind(*args, **arguments)
+    except (TypeError, ValueError) as error:  # ValueError: a class of C code that does not tell what it takes
+        raise ConfigError(f"{config['_target_']}: {error}.{_suggestion(target, arguments)}") from error
+    try:
+        return target(*args, **arguments)
+    except HudepthError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{config['_target_']}: {error}") from error
+
+
+def _suggestion(target: type, arguments: Mapping[str, Any]) -> str:
+    try:
+        parameters = list(inspect.signature(target).parameters)
+    except ValueError:
+        return ""
+    unknown = [name for name in arguments if name not in parameters]
+    if not unknown:
+        return ""
+    return did_you_mean(unknown[0], parameters) or f" It takes {', '.join(parameters) or 'no arguments'}."
+
+
+def _locate(target: str, prefixes: tuple[str, ...]) -> type:
+    if not target.startswith(prefixes):
+        raise ConfigError(
+            f"_target_: '{target}' is not under a trusted module ({', '.join(p.rstrip('.') for p in prefixes)}). "
+            f"If it is your own code, pass trust=[{target.split('.')[0]}]."
+        )
+    module_name, _, name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(f"_target_: '{target}' cannot be imported ({error}).") from error
+    found = getattr(module, name, None)
+    if not _is_trusted(found, prefixes):
+        classes = [key for key, value in vars(module).items() if _is_trusted(value, prefixes)]
+        raise ConfigError(f"_target_: '{target}' is not a class of a trusted module.{did_you_mean(name, classes)}")
+    return cast(type, found)
+
+
+def _is_trusted(value: object, prefixes: tuple[str, ...]) -> bool:
+    return inspect.isclass(value) and f"{value.__module__}.".startswith(prefixes)

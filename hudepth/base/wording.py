@@ -1,0 +1,96 @@
+"""Errors as one line for the person at the prompt: those of Hydra and OmegaConf are translated."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from hudepth.base.errors import HudepthError, did_you_mean
+from hudepth.base.verbs import conf_folder, options_of
+
+LAUNCHERS = {
+    "joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "submitit": "slurm", "ray": "ray",
+}  # fmt: skip
+"""Ways to run the jobs of a sweep, and the extra of this package that installs each."""
+
+
+def one_line(error: BaseException, task: str) -> str:
+    """Say an error in one line that names the mend.
+
+    Args:
+        error: whatever was raised.
+        task: whose configuration names are suggested.
+    """
+    chain = list(_chain(error))
+    for cause in chain:
+        if isinstance(cause, HudepthError):
+            return " ".join(str(cause).split())
+    for cause in chain:
+        if line := _config_line(cause, task):
+            return line
+    message = " ".join(str(error).split()) or type(error).__name__
+    return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _config_line(error: BaseException, task: str) -> str | None:
+    """Word the errors of Hydra and OmegaConf, with suggestions."""
+    module = type(error).__module__.partition(".")[0]
+    if module not in ("hydra", "omegaconf", "antlr4"):
+        return None
+    text = str(error)
+    if found := re.search(r"Could not find '([^']+)'", text):
+        group, _, name = found[1].rpartition("/")
+        options = options_of(group)
+        if options:
+            options += [each for each in (*LAUNCHERS, "basic") if group == "hydra/launcher" and each not in options]
+            return f"{group}: no '{name}'.{did_you_mean(name, options)} Pass one of {', '.join(options)}."
+    if found := re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", text):
+        key = found[1] or getattr(error, "full_key", None) or found[2]
+        plus = (
+            f" Further arguments of lightning.Trainer take a plus: +{key}=<value>."
+            if key.startswith("trainer.")
+            else ""
+        )
+        known = known_keys(task)
+        hint = "" if key in known else did_you_mean(key, known)  # a group, but of another task
+        return f"no key '{key}'.{hint} See hudepth-{task} --cfg job for all keys.{plus}"
+    if "Override" in type(error).__name__ or module == "antlr4" or "NoViableAlt" in text:
+        typed = getattr(error, "override", None) or text.split(": ", 1)[-1]
+        return f"cannot read '{typed}': write key=value, and quote values with special characters: 'key=\"a, b\"'."
+    return " ".join(text.split())
+
+
+def known_keys(task: str) -> list[str]:
+    """Return all dotted keys and groups of the task's configuration, with the groups chosen on the command line."""
+    from hydra import compose, initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import OmegaConf
+
+    GlobalHydra.instance().clear()
+    with initialize_config_module("hudepth.conf", version_base="1.3"):
+        try:
+            config = compose(task, overrides=_chosen_groups())
+        except Exception:  # a group chosen that this task does not have, which may be the very mistake
+            config = compose(task)
+    keys = list(_dotted(OmegaConf.to_container(config, resolve=False)))
+    return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
+
+
+def _chosen_groups() -> list[str]:
+    pairs = [argument.partition("=") for argument in sys.argv[1:]]
+    return [f"{group}={name}" for group, _, name in pairs if name in options_of(group.lstrip("+"))]
+
+
+def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
+    for key, value in config.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _dotted(value, f"{prefix}{key}.")

@@ -1,0 +1,1 @@
+"""hudepth-data audit: leaks between subsets, units, duplicates."""

@@ -1,0 +1,232 @@
+"""Light and the camera's flaws for the built-in rooms: from traced surfaces to an RGB image."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hudepth.base.camera import Intrinsics
+from hudepth.data.rooms.materials import Material, pattern_weight
+from hudepth.data.rooms.raycast import (
+    BOX,
+    CYLINDER,
+    F32,
+    F64,
+    ROOM_FACES,
+    Solids,
+    View,
+    trace,
+)
+
+_SHADOW_REACH = 2.5
+_SHADOW_CELLS = 224
+
+
+class Light(NamedTuple):
+    """A lamp with distance falloff."""
+
+    position: F64
+    """[3] metres."""
+    colour: F64
+    """[3] linear RGB, the irradiance at one metre."""
+
+
+class Scene(NamedTuple):
+    """All that is needed to picture a room from any place in it."""
+
+    room_size: F64
+    """[3] metres."""
+    solids: Solids
+    materials: list[Material]
+    surface_material: NDArray[np.int16]
+    """[6 + n] index into ``materials`` of each room face and solid."""
+    ceiling_light: Light
+    """The one that casts shadows."""
+    fill_light: Light
+    ambient: F64
+    """[3] linear RGB."""
+    shadow: F32
+    """[cells, cells] metres below the ceiling light to the first surface, see :func:`shadow_map`."""
+
+
+def shadow_map(room_size: F64, solids: Solids, light_position: F64) -> F32:
+    """Trace rays down from a light; a point further below than its cell says lies in shadow.
+
+    Cells are equally spaced in slope (horizontal over vertical distance), within ``+-_SHADOW_REACH``.
+    """
+    slopes = np.linspace(-_SHADOW_REACH, _SHADOW_REACH, _SHADOW_CELLS, dtype=np.float32)
+    axes = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return trace(View(light_position, axes, slopes, slopes), room_size, solids)[0]
+
+
+class _Hits(NamedTuple):
+    """What the rays of a view met, flat: n = h * w."""
+
+    point: F32
+    """[3, n] world coordinates, metres."""
+    normal: F32
+    """[3, n] world, towards the viewer's side of the surface."""
+    u: F32
+    v: F32
+    surface: NDArray[np.int16]
+
+
+def _hits(scene: Scene, view: View, depth: F32, surface: NDArray[np.int16]) -> _Hits:
+    """Find point, normal and face coordinates of every hit, in the solid's own frame and in the world."""
+    axes = view.axes.astype(np.float32)
+    flat, z = surface.ravel(), depth.ravel()
+    rays = [np.add.outer(view.ys * axes[1, k], view.xs * axes[0, k] + axes[2, k]).ravel() for k in range(3)]
+    point = np.stack([ray * z + np.float32(view.origin[k]) for k, ray in enumerate(rays)])
+
+    solids = scene.solids
+    room = np.repeat(scene.room_size[None] / 2, ROOM_FACES, 0)
+    centre = np.concatenate([room, solids.centre]).astype(np.float32)
+    half = np.concatenate([room, solids.half]).astype(np.float32)
+    yaw = np.concatenate([np.zeros(ROOM_FACES), solids.yaw])
+    cos, sin = np.cos(yaw).astype(np.float32)[flat], np.sin(yaw).astype(np.float32)[flat]
+    dx, dy, dz = (point[k] - centre[flat, k] for k in range(3))
+    local: F32 = np.stack([dx * cos - dz * sin, dy, dx * sin + dz * cos])
+    unit: F32 = local / half.T[:, flat]
+
+    axis = np.abs(unit).argmax(0)
+    side = np.where(flat < ROOM_FACES, np.float32(-1), np.float32(1))
+    normal = np.zeros_like(local)
+    picked = np.take_along_axis(unit, axis[None], 0)[0]
+    np.put_along_axis(normal, axis[None], (np.sign(picked) * side)[None], 0)
+    kind = np.concatenate([np.full(ROOM_FACES, BOX), solids.kind])[flat]
+    i = np.flatnonzero(kind != BOX)
+    normal[:, i] = _round_normal(unit[:, i], half[flat[i]].T, tube=kind[i] == CYLINDER)
+    u = np.where(axis == 0, local[2], local[0])
+    v = np.where(axis == 1, local[2], local[1])
+    world = np.stack([normal[0] * cos + normal[2] * sin, normal[1], normal[2] * cos - normal[0] * sin])
+    return _Hits(point, world, u, v, flat)
+
+
+def _round_normal(unit: F32, half: F32, *, tube: NDArray[np.bool_]) -> F32:
+    """Return the normals [3, n] of ellipsoids, and of cylinders where ``tube``, in the solid's own frame."""
+    normal: F32 = unit / half
+    normal[1, tube] = 0
+    cap = tube & (np.abs(unit[1]) > 0.9999)
+    normal[:, cap] = np.sign(unit[1, cap]) * np.array([[0], [1], [0]], np.float32)
+    normal /= np.linalg.norm(normal, axis=0) + np.float32(1e-9)
+    return normal
+
+
+def _albedo(scene: Scene, hits: _Hits, footprint: F32) -> tuple[F32, NDArray[np.bool_]]:
+    """Return linear RGB [3, n] of every point, and which of them glow."""
+    material = scene.surface_material[hits.surface]
+    patterns = sorted({m.pattern for m in scene.materials})
+    pattern = np.array([patterns.index(m.pattern) for m in scene.materials], np.int8)[material]
+    first = np.array([m.first for m in scene.materials], np.float32)
+    change = np.array([m.second for m in scene.materials], np.float32) - first
+    scale = np.array([m.scale_m for m in scene.materials], np.float32)
+    albedo = np.empty((3, material.size), np.float32)
+    for number, name in enumerate(patterns):
+        i = np.flatnonzero(pattern == number)
+        if i.size:
+            m = material[i]
+            weight = pattern_weight(name, hits.u[i], hits.v[i], scale[m], footprint[i])
+            albedo[:, i] = first[m].T + weight * change[m].T
+    return np.maximum(albedo, 0), pattern == (patterns.index("glow") if "glow" in patterns else -1)
+
+
+def _lit_fraction(scene: Scene, point: F32, upwards: F32) -> F32:
+    """Return how much of the ceiling light reaches each point [n], from four cells of the shadow map."""
+    light = scene.ceiling_light.position.astype(np.float32)
+    drop = light[1] - point[1]
+    per_slope = np.float32((_SHADOW_CELLS - 1) / (2 * _SHADOW_REACH))
+    steep = per_slope / np.maximum(drop, 1e-3)
+    a = (point[0] - light[0]) * steep + np.float32((_SHADOW_CELLS - 1) / 2)
+    b = (point[2] - light[2]) * steep + np.float32((_SHADOW_CELLS - 1) / 2)
+    inside = (a > 1) & (a < _SHADOW_CELLS - 2) & (b > 1) & (b < _SHADOW_CELLS - 2) & (drop > 0.05)
+    i = np.flatnonzero(inside)
+    a, b = a[i], b[i]
+    # A standing face spans drop / slope times a cell's width in one cell: with less leave it shades itself.
+    slope = np.hypot(a - (_SHADOW_CELLS - 1) / 2, b - (_SHADOW_CELLS - 1) / 2)
+    limit = drop[i] * (1 - (1 - np.abs(upwards[i])) * 1.5 / np.maximum(slope, 1)) - np.float32(0.03)
+    across, along = a % 1, b % 1
+    cell = b.astype(np.int32) * _SHADOW_CELLS + a.astype(np.int32)
+    flat = scene.shadow.ravel()
+    near = (flat[cell] > limit) * (1 - across) + (flat[cell + 1] > limit) * across
+    far = (flat[cell + _SHADOW_CELLS] > limit) * (1 - across) + (flat[cell + _SHADOW_CELLS + 1] > limit) * across
+    lit = np.ones(point.shape[1], np.float32)
+    lit[i] = near * (1 - along) + far * along
+    return lit
+
+
+def _irradiance(light: Light, hits: _Hits) -> F32:
+    """Lambert's cosine times the falloff with distance, [n]; softened, since a real lamp has a size."""
+    towards = light.position.astype(np.float32)[:, None] - hits.point
+    squared = np.einsum("kn,kn->n", towards, towards)
+    cosine = np.einsum("kn,kn->n", towards, hits.normal) / np.sqrt(squared)
+    irradiance: F32 = np.maximum(cosine, 0) / (0.8 + squared)
+    return irradiance
+
+
+def _corner_shade(scene: Scene, hits: _Hits) -> F32:
+    """Darken towards the edges of the room, where less light arrives from around, [n]."""
+    shade = np.ones(hits.point.shape[1], np.float32)
+    for k in range(3):
+        for gap in (hits.point[k], np.float32(scene.room_size[k]) - hits.point[k]):
+            shade *= 1 - 0.03 / (np.maximum(gap, 0) + 0.12) * (1 - np.abs(hits.normal[k]))
+    return shade
+
+
+def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[np.uint8], F32]:
+    """Picture a scene.
+
+    Args:
+        scene: what there is to see.
+        view: the camera's rays.
+        rng: draws exposure, white balance and sensor noise; geometry does not depend on it.
+
+    Returns:
+        image [h, w, 3] RGB, and depth [h, w] along the optical axis [m].
+    """
+    depth, surface = trace(view, scene.room_size, scene.solids)
+    hits = _hits(scene, view, depth, surface)
+    height, width = depth.shape
+    flat = depth.ravel()
+    facing = np.abs(np.einsum("kn,kn->n", view.origin.astype(np.float32)[:, None] - hits.point, hits.normal))
+    pixel = np.float32(1 / Intrinsics.of_nyu(height, width).fx)
+    albedo, glow = _albedo(scene, hits, flat * flat * pixel / np.maximum(facing, 1e-2))
+
+    corner = _corner_shade(scene, hits)
+    ceiling = _irradiance(scene.ceiling_light, hits) * _lit_fraction(scene, hits.point, hits.normal[1])
+    fill = _irradiance(scene.fill_light, hits)
+    sky = corner * (0.82 + 0.12 * hits.normal[1] + 0.08 * hits.normal[0])
+    light = np.stack(
+        [
+            np.float32(scene.ambient[c]) * sky
+            + np.float32(scene.ceiling_light.colour[c]) * ceiling
+            + np.float32(scene.fill_light.colour[c]) * fill
+            for c in range(3)
+        ]
+    )
+    light[:, glow] = 1
+    return _expose((albedo * light).reshape(3, height, width), view, rng), depth
+
+
+@cache
+def _tone_curve() -> F32:
+    """4096 steps of linear light in [0, 2) to 8-bit values, with a soft shoulder instead of a hard clip."""
+    linear = np.arange(4096) / 2048
+    curve: F32 = (255 * np.sqrt((1 - np.exp(-1.9 * linear)) / (1 - np.exp(-3.8)))).astype(np.float32)
+    return curve
+
+
+def _expose(linear: F32, view: View, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Turn [3, h, w] linear light into [h, w, 3] 8 bit, with a lens's blur and a sensor's noise."""
+    linear[:, 1:-1] = 0.5 * linear[:, 1:-1] + 0.25 * (linear[:, :-2] + linear[:, 2:])
+    linear[:, :, 1:-1] = 0.5 * linear[:, :, 1:-1] + 0.25 * (linear[:, :, :-2] + linear[:, :, 2:])
+    gain = 0.15 * rng.uniform(0.5, 1.6) / float(np.minimum(linear[1], 3.0).mean())
+    balance = gain * np.array([rng.uniform(0.94, 1.08), 1, rng.uniform(0.9, 1.08)])
+    vignette = 1 - np.float32(rng.uniform(0.1, 0.35)) * np.add.outer(view.ys**2, view.xs**2)
+    linear *= vignette * balance.astype(np.float32)[:, None, None]
+    step = np.minimum(linear * np.float32(2048), np.float32(4095)).astype(np.int16)
+    image: F32 = _tone_curve()[step.transpose(1, 2, 0)]
+    image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(rng.uniform(1.0, 4.0))
+    return np.clip(image, 0, 255).astype(np.uint8)

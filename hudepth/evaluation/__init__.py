@@ -1,0 +1,1 @@
+"""hudepth-test: scoring a model under test protocols."""

@@ -1,0 +1,129 @@
+"""Trivial baselines that any model must beat, made from the training subset alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hudepth.base.console import track
+from hudepth.base.normalise import normalise_image
+from hudepth.data.store import DepthStore
+
+DESCRIPTOR_SIZE = (10, 10)
+"""Rows and columns of the thumbnail that :class:`NearestFrame` compares images by."""
+_CHUNK = 64
+
+
+class Baseline(nn.Module):
+    """Answers without a network. Mirrored images are none of its business: test-time flips leave it alone."""
+
+
+class ConstantDepth(Baseline):
+    """Answers every image with the same unit depth map.
+
+    Args:
+        unit_depth: [1, 1, h, w].
+    """
+
+    unit_depth: Tensor
+
+    def __init__(self, unit_depth: Float[Tensor, "1 1 h w"]) -> None:
+        super().__init__()
+        self.register_buffer("unit_depth", unit_depth)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Return the map, once for each image."""
+        return self.unit_depth.expand(len(image), -1, -1, -1)
+
+
+class NearestFrame(Baseline):
+    """Copies the depth of the training image that looks most alike.
+
+    It has learnt nothing. Where it comes near a network, test images have near duplicates in training.
+
+    Args:
+        store: holds the depths.
+        train: positions of the training pairs.
+        descriptors: of the training images, as :func:`descriptor` makes them.
+        fill: unit depth where the copied truth is unmeasured, [1, 1, h, w].
+        max_depth_m: depth is clipped to it and divided by it.
+    """
+
+    descriptors: Tensor
+    fill: Tensor
+
+    def __init__(
+        self,
+        store: DepthStore,
+        train: Sequence[int],
+        *,
+        descriptors: Float[Tensor, "n d"],
+        fill: Float[Tensor, "1 1 h w"],
+        max_depth_m: float,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("descriptors", descriptors)
+        self.register_buffer("fill", fill)
+        self._store, self._train, self._max_depth_m = store, list(train), max_depth_m
+
+    def nearest(self, image: Float[Tensor, "b 3 h w"]) -> list[int]:
+        """Return the store positions of the training images most alike normalised images."""
+        query = descriptor(image)
+        # |a - b|^2 less |a|^2, which does not change which b is nearest
+        distance = self.descriptors.square().sum(dim=1) - 2 * query @ self.descriptors.T
+        return [self._train[i] for i in distance.argmin(dim=1).tolist()]
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Return the depth of the nearest training image, once for each image."""
+        _, depth_mm = self._store.read(self.nearest(image))
+        unit = _unit_depth(depth_mm, self._max_depth_m).float()[:, None].to(image.device)
+        return torch.where(unit > 0, unit, self.fill)
+
+
+def descriptor(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
+    """Describe images by a thumbnail of their normalised colours, averaged over areas."""
+    return functional.adaptive_avg_pool2d(image.float(), DESCRIPTOR_SIZE).flatten(1)
+
+
+def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: float) -> dict[str, Baseline]:
+    """Make the baselines in one pass over the training pairs.
+
+    Args:
+        store: holds the pairs.
+        train: positions of the training pairs.
+        max_depth_m: depth is clipped to it and divided by it.
+
+    Returns:
+        ``nearest_frame``: the depth of the training image most alike; ``mean_depth_map``: each pixel's mean over the
+        training set; ``mean_depth``: one mean for all pixels.
+    """
+    total = torch.zeros(store.size, dtype=torch.float64)
+    count = torch.zeros(store.size, dtype=torch.float64)
+    described = []
+    starts = range(0, len(train), _CHUNK)
+    for start in track(starts, total=len(starts), what="trivial baselines"):
+        images, depth_mm = store.read(train[start : start + _CHUNK])
+        # pooled before it is normalised: the order does not matter, and the thumbnail is smaller
+        small = functional.adaptive_avg_pool2d(torch.from_numpy(images).permute(0, 3, 1, 2).float(), DESCRIPTOR_SIZE)
+        described.append(normalise_image(small / 255).flatten(1))
+        unit = _unit_depth(depth_mm, max_depth_m)
+        total += unit.sum(dim=0)
+        count += (unit > 0).sum(dim=0)
+    mean = total.sum() / count.sum()
+    mean_map = torch.where(count > 0, total / count.clamp(min=1), mean).float()[None, None]
+    return {
+        "nearest_frame": NearestFrame(
+            store, train, descriptors=torch.cat(described), fill=mean_map, max_depth_m=max_depth_m
+        ),
+        "mean_depth_map": ConstantDepth(mean_map),
+        "mean_depth": ConstantDepth(mean.expand(store.size).float()[None, None]),
+    }
+
+
+def _unit_depth(depth_mm: np.ndarray, max_depth_m: float) -> Float[Tensor, "n h w"]:
+    return (torch.from_numpy(depth_mm).double() / (1000 * max_depth_m)).clamp_(max=1)

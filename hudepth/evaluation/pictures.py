@@ -1,0 +1,98 @@
+"""Panels of a finished run, drawn anew from its checkpoint and its data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from hudepth.base.errors import DataError
+from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.dataset import StoreDataset
+from hudepth.data.store import DepthStore
+from hudepth.evaluation.test_data import open_data
+from hudepth.runs.checkpoint import load_checkpoint
+from hudepth.viz.panels import Panel
+
+
+def run_panels(
+    run: Path, choose: Callable[[DepthDataModule], Sequence[int]], *, config: Mapping[str, Any]
+) -> list[Panel]:
+    """Predict some pairs of a run's data with its best checkpoint.
+
+    Args:
+        run: the run directory.
+        choose: returns the positions of the pairs in the depth store.
+        config: with ``paths``, ``data`` (keys that stand above the checkpoint's) and ``trust``.
+
+    Raises:
+        HudepthError: if the checkpoint or the data is not there or not what it was.
+    """
+    checkpoint = load_checkpoint(str(run))
+    typed = {"cache": config["paths"]["cache"], **config["data"]}
+    datamodule, _ = open_data(checkpoint, typed, overrides=[], trust=config["trust"])
+    net = checkpoint.build_net(trust=config["trust"])
+    return make_panels(net, datamodule.store, choose(datamodule), max_depth_m=datamodule.max_depth_m)
+
+
+def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mapping[str, Any]) -> list[Panel]:
+    """Predict the same images with several runs: for each image a row a run, titled with the run's name.
+
+    Args:
+        runs: run directories by the name to show.
+        ids: of the images.
+        config: as for :func:`run_panels`.
+
+    Raises:
+        HudepthError: as :func:`run_panels`, or if a run's data does not have an image.
+    """
+
+    def positions(datamodule: DepthDataModule) -> list[int]:
+        known = {record.id: position for position, record in enumerate(datamodule.store.records)}
+        lacking = [image for image in ids if image not in known]
+        if lacking:
+            raise DataError(f"the data has no image '{lacking[0]}'.")
+        return [known[image] for image in ids]
+
+    rows = [
+        [replace(panel, title=f"{name}: {panel.title}") for panel in run_panels(run, positions, config=config)]
+        for name, run in runs.items()
+    ]
+    return [panel for same in zip(*rows, strict=True) for panel in same]
+
+
+@torch.inference_mode()
+def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float) -> list[Panel]:
+    """Predict some pairs of a store and return them as rows of a picture.
+
+    Args:
+        module: normalised image to unit depth.
+        store: holds the pairs.
+        indices: which of them.
+        max_depth_m: what unit depth 1 stands for.
+    """
+    panels = []
+    was_training = module.training
+    module.eval()
+    device = next(module.parameters()).device
+    dataset = StoreDataset(store, indices)
+    for position in range(len(dataset)):  # no DataLoader: it would draw from the generator that training draws from
+        raw = dataset[position]
+        batch = preprocess(raw, max_depth_m=max_depth_m)
+        pred_m = module(batch["image"].to(device)).float().cpu()[0, 0] * max_depth_m
+        truth_m = np.minimum(raw["depth_mm"][0].numpy() / np.float32(1000), np.float32(max_depth_m))
+        record = store.records[int(raw["index"][0])]
+        panels.append(Panel(raw["image"][0].numpy(), truth_m, pred_m.numpy(), title=record.id))
+    module.train(was_training)
+    return panels
+
+
+def evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
+    """Pick ``count`` of ``indices`` (all, if there are fewer), evenly spaced, always the same."""
+    count = min(count, len(indices))
+    return [indices[i * len(indices) // count] for i in range(count)]

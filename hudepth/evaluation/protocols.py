@@ -1,0 +1,29 @@
+"""Test protocols from a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from hudepth.base.errors import ConfigError
+from hudepth.base.instantiate import instantiate
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.metrics.protocol import Protocol
+
+
+def build_protocols(protocols: Mapping[str, Any], *, datamodule: DepthDataModule, trust: list[str]) -> list[Protocol]:
+    """Build the test protocols of a configuration, in its order.
+
+    Raises:
+        ConfigError: if there is none, one cannot be built, or one needs what the data is prepared without.
+    """
+    built = [instantiate(protocol, trust=trust, only=Protocol) for protocol in protocols.values() if protocol]
+    if not built:
+        raise ConfigError("protocol: none is given. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
+    native = [protocol.name for protocol in built if protocol.needs_native]
+    if native and not datamodule.native:
+        raise ConfigError(
+            f"protocol={native[0]} scores at native resolution, which data.native=false leaves out. "
+            "Pass data.native=true, or protocol=paper."
+        )
+    return built

@@ -1,0 +1,101 @@
+"""One pass over a test subset: any number of predictors, scored under any number of protocols."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float64
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+
+from hudepth.base.errors import ConfigError
+from hudepth.base.types import Batch
+from hudepth.evaluation.baselines import Baseline
+from hudepth.evaluation.scoring import BatchScores, BatchTruth
+from hudepth.metrics.protocol import Protocol
+
+
+class Evaluation(LightningModule):
+    """Collects, for each predictor and protocol, one row of sums an image. Run it with ``Trainer.test``.
+
+    Args:
+        predictors: by name; normalised image to unit depth.
+        protocols: how to score.
+        max_depth_m: what unit depth 1 stands for.
+        detailed: the predictor whose boundaries and strata are measured too, where a protocol asks for them.
+
+    Raises:
+        ConfigError: if two protocols have one name, which would mix their rows.
+    """
+
+    def __init__(
+        self,
+        predictors: Mapping[str, nn.Module],
+        protocols: Sequence[Protocol],
+        *,
+        max_depth_m: float,
+        detailed: str | None = None,
+    ) -> None:
+        super().__init__()
+        self.predictors = nn.ModuleDict(dict(predictors))
+        self.protocols = list(protocols)
+        names = [protocol.name for protocol in protocols]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"protocol: two have one name among {', '.join(names)}. Give each its own name.")
+        self.max_depth_m, self.detailed = max_depth_m, detailed
+        self._collected: dict[tuple[str, ...], list[Tensor]] = {}
+        self.indices: list[int] = []
+        """Store positions of the scored images, in the order of the rows; known when the test has ended."""
+        self.sums: dict[tuple[str, str], Float64[Tensor, "n k"]] = {}
+        """Rows by predictor and protocol, an image each; known when the test has ended."""
+        self.boundary: dict[str, Float64[Tensor, "n k"]] = {}
+        """Boundary metrics of the detailed predictor by protocol, an image a row, where asked for."""
+        self.strata: dict[str, Float64[Tensor, "n bins k"]] = {}
+        """Sums over strata of the detailed predictor by protocol, where asked for."""
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        """Score a batch."""
+        self._keep(batch["index"], "index")
+        truth = BatchTruth(batch, max_depth_m=self.max_depth_m)
+        for name, predictor in self.predictors.items():
+            plain, flipped = self._predict(predictor, batch["image"])
+            plain_scores = BatchScores(plain, truth)
+            flipped_scores = plain_scores if flipped is None else BatchScores(flipped, truth)
+            for protocol in self.protocols:
+                scores = flipped_scores if protocol.flip else plain_scores
+                self._keep(scores.sums(protocol), "sums", name, protocol.name)
+                if name == self.detailed and protocol.boundary:
+                    self._keep(scores.boundary(protocol), "boundary", protocol.name)
+                if name == self.detailed and protocol.strata:
+                    self._keep(scores.strata(protocol), "strata", protocol.name)
+
+    def _predict(self, predictor: nn.Module, image: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the prediction [m], and its mean with that of the mirrored image if a protocol wants it."""
+        plain: Tensor = predictor(image).float() * self.max_depth_m
+        if isinstance(predictor, Baseline) or not any(protocol.flip for protocol in self.protocols):
+            return plain, None
+        mirrored: Tensor = predictor(image.flip(-1)).float() * self.max_depth_m
+        return plain, (plain + mirrored.flip(-1)) / 2
+
+    def _keep(self, rows: Tensor, *key: str) -> None:
+        self._collected.setdefault(key, []).append(rows.cpu())
+
+    def on_test_epoch_end(self) -> None:
+        """Collect the rows of all processes, in the order of the store."""
+        gathered = {key: torch.cat(self._gathered(rows)) for key, rows in self._collected.items()}
+        indices = gathered.pop(("index",))
+        order = indices.argsort()
+        self.indices = indices[order].tolist()
+        for (kind, *rest), rows in gathered.items():
+            if kind == "sums":
+                self.sums[rest[0], rest[1]] = rows[order]
+            else:
+                {"boundary": self.boundary, "strata": self.strata}[kind][rest[0]] = rows[order]
+
+    def _gathered(self, own: list[Tensor]) -> list[Tensor]:
+        if self.trainer.world_size == 1:
+            return own
+        everyone: list[list[Tensor]] = [[]] * self.trainer.world_size
+        torch.distributed.all_gather_object(everyone, own)
+        return [rows for process in everyone for rows in process]

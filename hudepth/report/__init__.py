@@ -1,0 +1,1 @@
+"""hudepth-report: results of runs, side by side."""

@@ -1,0 +1,145 @@
+"""What was varied in a sweep, found from the configurations of its rows and not from what was typed."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hudepth.runs.sweeps import SEEDS, identity
+
+TARGET = "_target_"
+ABSENT = "-"
+"""Shown where a row's configuration has no such key."""
+LONGEST = 40
+"""Letters of a value that are shown."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One thing that was varied."""
+
+    key: str
+    """Dotted, as in config.yaml; that of a class ends in ``_target_``."""
+    name: str
+    """Short, for the head of a column."""
+    values: list[Any]
+    """A value for each row; None both for null and for rows without the key."""
+    shown: list[str]
+    """The same in letters."""
+
+
+def variant(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what repetitions of one configuration share: its identity without :data:`hudepth.runs.sweeps.SEEDS`."""
+    return {key: value for key, value in identity(config).items() if key not in SEEDS}
+
+
+def variant_key(config: Mapping[str, Any]) -> str:
+    """Return a text that is equal for repetitions of one configuration."""
+    return json.dumps({key: spelt(value) for key, value in variant(config).items()}, sort_keys=True)
+
+
+def seed_of(config: Mapping[str, Any]) -> str:
+    """Return in which repetition a run is: ``1``, or ``1/7`` where the data has another seed than the training."""
+    data = config.get("data")
+    seeds = [config.get("seed"), data.get("seed") if isinstance(data, Mapping) else None]
+    return "/".join(dict.fromkeys(str(seed) for seed in seeds if seed is not None)) or ABSENT
+
+
+def spelt(value: Any) -> str:
+    """Return a text that is equal for equal values; 1 and 1.0 are equal, 1 and true are not."""
+    if isinstance(value, bool) or value is None or isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(float(value))
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(spelt, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{','.join(f'{key}:{spelt(value[key])}' for key in sorted(value, key=str))}}}"
+    return str(value)
+
+
+def find_factors(variants: Sequence[Mapping[str, Any]]) -> list[Factor]:
+    """Return what differs between rows.
+
+    What belongs to a class that differs, like the options of one loss among several, is a factor only if it differs
+    between rows of the same class.
+
+    Args:
+        variants: for each row what :func:`variant` returns.
+    """
+    rows = [_whole(row, variants) for row in variants]
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    found = [key for key in keys if _varies(key, rows)]
+    names = _names(found)
+    return [
+        Factor(
+            key,
+            names[key],
+            [row.get(key) for row in rows],
+            [shown(row[key], of_class=_is_target(key)) if key in row else ABSENT for row in rows],
+        )
+        for key in found
+    ]
+
+
+def config_differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return every key in which two variants differ, with both values in letters and in full."""
+    keys = dict.fromkeys([*a, *b])
+    return [
+        (key, _full(a[key]) if key in a else ABSENT, _full(b[key]) if key in b else ABSENT)
+        for key in keys
+        if (key in a) != (key in b) or spelt(a.get(key)) != spelt(b.get(key))
+    ]
+
+
+def shown(value: Any, *, of_class: bool = False) -> str:
+    """Return a value as a cell of a table has room for it: classes and files without where they lie."""
+    text = _full(value)
+    if value is None:
+        return "none"
+    if isinstance(value, str):
+        text = text.rpartition("." if of_class else "/")[2] or text
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
+
+
+def _full(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float):
+        return f"{value:g}" if float(f"{value:g}") == value else repr(value)
+    return json.dumps(value, default=str)
+
+
+def _is_target(key: str) -> bool:
+    return key == TARGET or key.endswith(f".{TARGET}")
+
+
+def _whole(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Say ``early_stopping: null`` in the words of rows that have a class there: ``early_stopping._target_: null``."""
+    classes = {key.removesuffix(f".{TARGET}") for each in rows for key in each if _is_target(key)}
+    return {f"{key}.{TARGET}" if key in classes else key: value for key, value in row.items()}
+
+
+def _varies(key: str, rows: Sequence[Mapping[str, Any]]) -> bool:
+    owners = _owners(key)
+    values: dict[tuple[str, ...], set[str]] = {}
+    for row in rows:
+        classes = tuple(spelt(row.get(owner)) for owner in owners)
+        values.setdefault(classes, set()).add(spelt(row[key]) if key in row else ABSENT)
+    return any(len(each) > 1 for each in values.values())
+
+
+def _owners(key: str) -> list[str]:
+    """Return the keys of the classes that ``key`` may be an option of, nearest last."""
+    parts = key.split(".")[: -2 if _is_target(key) else -1]
+    return [".".join([*parts[:length], TARGET]) for length in range(1, len(parts) + 1)]
+
+
+def _names(keys: Sequence[str]) -> dict[str, str]:
+    groups = {key: key.removesuffix(f".{TARGET}") for key in keys}
+    short = {key: group.rpartition(".")[2] for key, group in groups.items()}
+    times = Counter(short.values())
+    return {key: short[key] if times[short[key]] == 1 else groups[key] for key in keys}

@@ -1,0 +1,154 @@
+"""A sweep in numbers: for each row its metrics, and how they differ from those of the reference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hudepth.base.errors import HudepthError
+from hudepth.metrics.bootstrap import REPEATS, SEED, Draws, Resampler, describe
+from hudepth.metrics.summary import ImageTable, higher_is_better
+from hudepth.report.ablation.cautions import other_versions, undefined, unpaired, versions_of
+from hudepth.report.ablation.estimates import contrast, estimate
+from hudepth.report.ablation.factors import Factor
+from hudepth.report.ablation.row import Row, choose_reference
+from hudepth.report.ablation.runs import Rows, Trouble
+from hudepth.runs.results import Result, paired, stamp_differences
+
+METRICS = (
+    "abs_rel", "rmse", "log10", "ssim", "delta1", "delta2", "delta3", "edge_f1_0.25", "edge_f1_0.5", "si_boundary_f1",
+)  # fmt: skip
+"""Columns, as far as results have them."""
+UNITS = {"rmse": "m"}
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that a report of a sweep says."""
+
+    protocol: str
+    metrics: list[str]
+    factors: list[Factor]
+    rows: list[Row]
+    reference: Row
+    troubles: list[Trouble]
+    warnings: list[str]
+    first: Result
+    """The reference's result of its lowest seed: what the others are held against."""
+    uncertainty: dict[str, Any]
+    """See :func:`hudepth.metrics.bootstrap.describe`."""
+    versions: dict[str, list[str]]
+    """Names of the runs that count by the version of hudepth that they were trained with."""
+
+
+def make_report(
+    rows: Rows, *, protocol: str, reference: str | None = None, repeats: int = REPEATS, seed: int = SEED
+) -> Report:
+    """Work out a sweep's table.
+
+    Args:
+        rows: of :func:`hudepth.report.ablation.runs.sort_runs`.
+        protocol: the results' name.
+        reference: a row by its label or by that of its ``variant``; default: the first that has a result.
+        repeats: of the bootstrap.
+        seed: of its draws.
+
+    Raises:
+        ConfigError: if there is no such row.
+        DataError: if no run has a result.
+    """
+    table = [Row(each) for each in rows.variants]
+    warnings: list[str] = []
+    chosen = choose_reference(table, reference, protocol=protocol)
+    chosen.is_reference = True
+    if reference is None and chosen is not table[0]:
+        warnings.append(f"'{table[0].label}' has no result, so '{chosen.label}' is the reference")
+    first = next(iter(chosen.runs.values())).result
+    metrics = [name for name in METRICS if any(name in r.result.metrics for row in table for r in row.runs.values())]
+    for row in table:
+        row.differs = list(dict.fromkeys(line for r in row.runs.values() for line in _differences(first, r.result)))
+        if row.differs:
+            who = "the seeds of the reference" if row is chosen else f"'{row.label}' and the reference"
+            warnings.append(f"{who} do not compare: {'; '.join(row.differs)}")
+    sampler = Resampler(first.table, repeats=repeats, seed=seed)
+    basis = {} if chosen.differs else _draws(chosen, first, metrics, sampler)
+    for row in [chosen, *(row for row in table if row is not chosen)]:  # the others need its metrics
+        _work_out(row, chosen, basis, first, metrics, sampler)
+    _mark_best(table, metrics)
+    versions = versions_of(table)
+    warnings += [*undefined(table, metrics), *unpaired(table, chosen), *other_versions(versions, chosen)]
+    uncertainty = describe(first.table, repeats=repeats, seed=seed)
+    return Report(protocol, metrics, rows.factors, table, chosen, rows.troubles, warnings, first, uncertainty, versions)
+
+
+def _differences(first: Result, other: Result) -> list[str]:
+    """Return what keeps a result from being paired with the first of the reference."""
+    if lines := stamp_differences(first, other):
+        return lines
+    try:
+        _aligned(first, other)
+    except HudepthError as error:
+        return [str(error)]
+    return []
+
+
+def _aligned(first: Result, other: Result) -> ImageTable:
+    """Return the images of a result in the order of the first."""
+    a, b = first.table, other.table
+    if a.ids == b.ids and a.scenes == b.scenes and np.array_equal(a.pixels, b.pixels):
+        return b
+    return paired(first, other)[1]
+
+
+def _draws(row: Row, first: Result, metrics: Sequence[str], sampler: Resampler) -> dict[str, Draws]:
+    """Return resampled metrics by seed."""
+    found = {}
+    for seed, each in row.runs.items():
+        table = _aligned(first, each.result)
+        kept = {name: table.values[name] for name in metrics if name in table.values}
+        found[seed] = sampler.draws(replace(table, values=kept), **each.result.averaging)
+    return found
+
+
+def _work_out(
+    row: Row, reference: Row, basis: Mapping[str, Draws], first: Result, metrics: Sequence[str], sampler: Resampler
+) -> None:
+    if not row.runs:
+        return
+    if row is reference:
+        draws = dict(basis)
+    elif row.differs:
+        draws = _own_draws(row, metrics, sampler)
+    else:
+        draws = _draws(row, first, metrics, sampler)
+    values = {name: {s: r.result.metrics.get(name, math.nan) for s, r in row.runs.items()} for name in metrics}
+    row.estimates = {name: estimate(name, values[name], draws) for name in metrics}
+    if row is reference or row.differs or reference.differs:
+        return
+    for name in metrics:
+        found = contrast(name, values[name], reference.estimates[name].values, draws, basis)
+        if found is not None:
+            row.contrasts[name] = found
+
+
+def _own_draws(row: Row, metrics: Sequence[str], like: Resampler) -> dict[str, Draws]:
+    """Return resampled metrics of a row that was tested on other images; none if its seeds differ in them."""
+    first = next(iter(row.runs.values())).result
+    if any(_differences(first, each.result) for each in row.runs.values()):
+        return {}
+    return _draws(row, first, metrics, Resampler(first.table, repeats=like.repeats, seed=like.seed))
+
+
+def _mark_best(table: Sequence[Row], metrics: Sequence[str]) -> None:
+    comparable = [row for row in table if row.runs and not row.differs]
+    for name in metrics if len(comparable) > 1 else ():
+        sign = 1 if higher_is_better(name) else -1
+        means = {id(row): sign * row.estimates[name].mean for row in comparable}
+        top = max((mean for mean in means.values() if not math.isnan(mean)), default=math.nan)
+        for row in comparable:
+            if means[id(row)] == top:
+                row.best.add(name)

@@ -1,0 +1,81 @@
+"""Numbers of a sweep's table in letters, the same in every form of the table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from hudepth.metrics.summary import higher_is_better
+from hudepth.report.ablation.estimates import Contrast, Interval
+from hudepth.report.ablation.report import UNITS, Report
+
+MOST_PLACES = 7
+
+
+def places(report: Report) -> dict[str, int]:
+    """Return the decimals of each metric: 4, 2 for large ones, and more where the largest mean has leading zeros."""
+    return {name: _places(row.estimates[name].mean for row in report.rows if row.estimates) for name in report.metrics}
+
+
+def _places(values: Iterable[float]) -> int:
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    if not largest:
+        return 4
+    return 2 if largest >= 10 else min(MOST_PLACES, max(4, 3 - math.floor(math.log10(largest))))
+
+
+def number(value: float, digits: int, *, sign: bool = False) -> str:
+    """Return a number with so many decimals; ``-`` if it is not finite."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
+
+
+def between(interval: Interval, digits: int, *, sign: bool = False) -> str:
+    """Return ``0.21 to 0.24``; empty if there is no interval."""
+    if not interval.known:
+        return ""
+    return f"{number(interval.low, digits, sign=sign)} to {number(interval.high, digits, sign=sign)}"
+
+
+def half_width(interval: Interval, digits: int) -> str:
+    """Return ``±0.01`` of an interval that lies evenly about its mean; empty if there is none."""
+    return f"±{number((interval.high - interval.low) / 2, digits)}" if interval.known else ""
+
+
+def heading(name: str) -> str:
+    """Return a metric's name, its unit, and which way is better."""
+    unit = f" [{UNITS[name]}]" if name in UNITS else ""
+    return f"{name}{unit} {'↑' if higher_is_better(name) else '↓'}"
+
+
+def rests_on(contrast: Contrast) -> str:
+    """Return what a verdict rests on if that is not both intervals: ``scenes alone``, for example of one seed."""
+    if contrast.seeds.known and contrast.scenes.known:
+        return ""
+    return "scenes alone" if contrast.scenes.known else "seeds alone" if contrast.seeds.known else "nothing"
+
+
+def about(report: Report) -> str:
+    """Return in one line what was tested on what."""
+    split, data, scenes = report.first.split, report.first.data, report.uncertainty["scenes"]
+    images = len(report.first.table.ids)
+    where = f"{scenes} scenes" if any(report.first.table.scenes) else "no scenes named"
+    return f"{report.protocol} protocol, {images} test images ({where}) of {data['source']}, {split['kind']} split"
+
+
+def seeds(report: Report) -> str:
+    """Return how many seeds rows have: ``3 seeds``, ``1 to 3 seeds``."""
+    counts = [len(row.runs) for row in report.rows if row.runs]
+    low, high = min(counts), max(counts)
+    return f"{low} seed{'s' * (low != 1)}" if low == high else f"{low} to {high} seeds"
+
+
+def method(report: Report) -> str:
+    """Return how intervals were made, and what a verdict needs."""
+    return (
+        "95 % intervals, each metric and row by itself: over seeds by Student's t, over scenes by an expanded "
+        f"percentile bootstrap of the mean over seeds ({report.uncertainty['repeats']} draws, the same for all rows). "
+        f"Differences from {report.reference.label} are paired by seed and by image; better or worse: both intervals, "
+        "where there are both, leave out 0."
+    )

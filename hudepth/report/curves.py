@@ -1,0 +1,54 @@
+"""Curves over the epochs of a run: figure 5 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from hudepth.base.errors import DataError
+from hudepth.metrics.summary import DEPTH_NAMES
+from hudepth.viz.panels import save_figure
+
+
+def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> Figure:
+    """Draw training and validation curves of the total loss and of each of its terms, a plot each.
+
+    Args:
+        history: rows with ``epoch``, ``train/<name>`` and ``val/<name>``.
+        title: above the figure.
+
+    Raises:
+        DataError: if the history holds no training loss.
+    """
+    names = [key.removeprefix("train/") for key in history[0] if key.startswith("train/")]
+    if not names:
+        raise DataError("the history of epochs holds no training loss (train/total). Pass that of a training run.")
+    names.sort(key=lambda name: name != "total")
+    figure = Figure(figsize=(3.4 * len(names), 3.2), dpi=110, layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=10)
+    first, last = history[0]["epoch"], history[-1]["epoch"]
+    for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        for stage, label in (("train", "training"), ("val", "validation")):
+            key = f"{stage}/{name}"
+            if stage == "val" and name in DEPTH_NAMES:  # the metric of that name, in another unit: silog
+                continue
+            points = [(row["epoch"], row[key]) for row in history if key in row]  # not every epoch validates
+            if points:
+                axis.plot(*zip(*points, strict=True), marker=".", label=label)
+        axis.set_title(f"{name} loss", fontsize=10)
+        axis.set_xlabel("epoch")
+        axis.set_xlim(first - 0.5, last + 0.5)
+        axis.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=1))
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def save_curves(path: Path, history: Sequence[Mapping[str, float]], *, title: str = "") -> None:
+    """Write :func:`draw_curves` as a PNG file."""
+    save_figure(path, draw_curves(history, title=title))

@@ -1,0 +1,131 @@
+"""Bundles: a model as a folder or zip to hand on, with weights that cannot hold code; the layout of model hubs.
+
+====================  ===============================================================================
+README.md             the model card
+config.json           model, data and split as in a checkpoint, without the places on the machine it comes from
+model.safetensors     the network's tensors
+model.onnx            RGB bytes in, metres out
+metrics/              test results, one file a protocol
+samples/              pictures
+====================  ===============================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from hudepth.base.errors import CheckpointError
+
+CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
+KIND = "hudepth-bundle"
+PRETRAINED = ("nyu",)
+"""Names that ``checkpoint=`` keeps for models that come with hudepth: ``nyu``, from ``experiments/strong_official``."""
+MAX_CONFIG_BYTES = 1 << 22
+MAX_WEIGHTS_BYTES = 1 << 32
+
+
+def pretrained(name: str) -> Path:
+    """Return the folder of a model that comes with hudepth.
+
+    Args:
+        name: one of :data:`PRETRAINED`.
+
+    Raises:
+        CheckpointError: if this installation lacks it.
+    """
+    spec = find_spec("hudepth.pretrained")
+    folders = list(spec.submodule_search_locations or []) if spec else []
+    folder = next((path for root in folders if is_bundle(path := Path(root) / name)), None)
+    if folder is None:
+        raise CheckpointError(
+            f"checkpoint: the weights of '{name}' are not part of this installation. Install hudepth anew, or pass a "
+            "run or a file."
+        )
+    return folder
+
+
+def is_bundle(path: Path) -> bool:
+    """Tell whether ``path`` looks like a bundle: a folder with configuration and weights, its weights, or a zip."""
+    if path.is_dir():
+        return (path / CONFIG).is_file() and (path / WEIGHTS).is_file()
+    return path.is_file() and path.suffix.lower() in (".zip", ".safetensors")
+
+
+def read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Any], int]:
+    """Read a bundle; nothing is unpacked to the disk, and nothing in it can run code.
+
+    Args:
+        path: a folder, its ``model.safetensors``, or a zip of the folder.
+
+    Returns:
+        What a checkpoint says of itself, its tensors, and the bytes they were read from.
+
+    Raises:
+        CheckpointError: if it is damaged, too large, holds paths outside its folder, or is no bundle.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    if path.suffix.lower() == ".zip":
+        config, weights = _from_zip(path)
+    else:
+        folder = path if path.is_dir() else path.parent
+        config, weights = _from_folder(folder)
+    try:
+        content = json.loads(config)
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"'{path}': its {CONFIG} cannot be read ({error}).") from error
+    if not isinstance(content, dict) or content.get("kind") != KIND:
+        raise CheckpointError(f"'{path}' is no bundle of hudepth's. Make one with hudepth-export format=bundle.")
+    try:
+        tensors = load(weights)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise CheckpointError(f"'{path}': its {WEIGHTS} is damaged or cut off ({error}).") from error
+    return content, {f"net.{name}": tensor for name, tensor in tensors.items()}, len(weights)
+
+
+def _from_folder(folder: Path) -> tuple[bytes, bytes]:
+    read = []
+    for name, limit in ((CONFIG, MAX_CONFIG_BYTES), (WEIGHTS, MAX_WEIGHTS_BYTES)):
+        file = folder / name
+        if not file.is_file():
+            raise CheckpointError(f"'{folder}' is no bundle: it has no {name}. Pass the folder that has.")
+        if file.stat().st_size > limit:
+            raise CheckpointError(f"'{file}' is refused: larger than {limit >> 20} MiB.")
+        read.append(file.read_bytes())
+    return read[0], read[1]
+
+
+def _from_zip(path: Path) -> tuple[bytes, bytes]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                _check_inside(path, name)
+            return _member(path, archive, CONFIG, MAX_CONFIG_BYTES), _member(path, archive, WEIGHTS, MAX_WEIGHTS_BYTES)
+    except CheckpointError:
+        raise
+    except Exception as error:  # zipfile knows a dozen ways in which a file can be broken
+        raise CheckpointError(f"'{path}' cannot be read as a zip; it is damaged or cut off ({error}).") from error
+
+
+def _check_inside(path: Path, name: str) -> None:
+    windows = PureWindowsPath(name)
+    if name.startswith("/") or windows.anchor or ".." in {*PurePosixPath(name).parts, *windows.parts}:
+        raise CheckpointError(f"'{path}' is refused: it holds '{name}', which leads out of its folder.")
+
+
+def _member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    """Read a file of the zip, at its top or in its only folder."""
+    found = [entry for entry in archive.infolist() if PurePosixPath(entry.filename).name == name]
+    found = [entry for entry in found if len(PurePosixPath(entry.filename).parts) <= 2]
+    if len(found) != 1:
+        raise CheckpointError(f"'{path}' is no bundle of hudepth's: it has {len(found) or 'no'} {name}.")
+    # weights hardly compress: what grows tenfold is made to fill the memory
+    if found[0].file_size > min(limit, 10 * path.stat().st_size + MAX_CONFIG_BYTES):
+        raise CheckpointError(f"'{path}' is refused: its {name} unpacks to {found[0].file_size >> 20} MiB.")
+    with archive.open(found[0]) as file:
+        return file.read(found[0].file_size)

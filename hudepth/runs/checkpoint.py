@@ -1,0 +1,237 @@
+"""Checkpoints: plain tensors, numbers, strings, lists and dicts, written whole and read without running code."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from torch import Tensor, nn
+
+from hudepth.runs import bundles, run_dir
+from hudepth.base.errors import CheckpointError, TrainingError
+from hudepth.base.files import written_whole
+from hudepth.base.instantiate import instantiate
+
+KEY = "hudepth"
+"""Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""
+VERSION = 1
+NET_PREFIX = "net."
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint beside its place, then renames it: a full disk or a kill never costs the previous one."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write ``checkpoint`` to ``path``, whole or not at all.
+
+        Raises:
+            TrainingError: if the disk is full or the folder cannot be written; the previous checkpoint is intact.
+        """
+        try:
+            with written_whole(Path(path)) as part:
+                torch.save(checkpoint, part)
+        except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
+            raise TrainingError(
+                f"the checkpoint '{path}' could not be saved ({_first_line(error)}). The previous one is intact: "
+                f"make space, then continue with hudepth-train resume={Path(path).parent.parent}"
+            ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint, read and checked but not yet built into a network."""
+
+    path: Path
+    run: Path | None
+    """The run directory it lies in, None if it was moved elsewhere."""
+    config: dict[str, Any]
+    """The run's resolved configuration."""
+    split: dict[str, Any]
+    """Summary of the split it was trained on."""
+    data: dict[str, Any]
+    """Source, fingerprint, encoding and number of pairs of the data it was trained on."""
+    epoch: int
+    """Finished epochs."""
+    state: dict[str, Tensor]
+    """The network's tensors."""
+    size_bytes: int
+    """Of what the tensors were read from: no honest network is larger."""
+
+    def build_net(self, *, trust: list[str]) -> nn.Module:
+        """Return the network in evaluation mode.
+
+        It is first laid out without memory and compared with the checkpoint's tensors, so that a configuration which
+        asks for more than the file holds is an error and not an exhausted machine. Code that the user trusts can do
+        as it likes anyway and need not bear being built twice.
+
+        Args:
+            trust: further modules whose classes the configuration may name.
+
+        Raises:
+            CheckpointError: if the tensors are not those of the configured network.
+            ConfigError: if the configuration names something that is not trusted, or no network.
+        """
+        model = dict(self.config["model"])
+        if "weights" in model:
+            model["weights"] = None  # the trunk's start does not matter any more
+        only = object if trust else nn.Module
+        if not trust:
+            if sum(tensor.nbytes for tensor in self.state.values()) > self.size_bytes:
+                raise CheckpointError(f"'{self.path}' is refused: its tensors claim more memory than the file holds.")
+            with torch.device("meta"):
+                self._check_fits(instantiate(model, only=only))
+        net: nn.Module = instantiate(model, trust=trust, only=only)
+        self.fill(net)
+        return net.eval()
+
+    def fill(self, net: nn.Module) -> None:
+        """Give a network these tensors.
+
+        Raises:
+            CheckpointError: if they are not those of such a network.
+        """
+        self._check_fits(net)
+        net.load_state_dict(self.state)
+
+    def _check_fits(self, net: nn.Module) -> None:
+        own, given = net.state_dict(), self.state
+        names = {**own, **given}
+        unlike = [n for n in names if n not in own or n not in given or own[n].shape != given[n].shape]
+        if unlike:
+            raise CheckpointError(
+                f"'{self.path}' is from another model: {len(unlike)} tensors do not fit "
+                f"{self.config['model'].get('_target_')}, the first is '{unlike[0]}'. "
+                "Pass a checkpoint whose configuration matches its weights."
+            )
+
+
+def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
+    """Return the file that ``spec`` means.
+
+    Args:
+        spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or
+            one of :data:`hudepth.runs.bundles.PRETRAINED`.
+        runs: where ``last`` looks.
+
+    Raises:
+        CheckpointError: if there is no such file.
+    """
+    if spec in bundles.PRETRAINED:
+        return bundles.pretrained(spec)
+    path = run_dir.newest_run(runs) if spec == "last" else Path(spec).expanduser()
+    if bundles.is_bundle(path):
+        return path
+    if path.is_dir():
+        folder = path / run_dir.CHECKPOINTS
+        for name in (run_dir.BEST, run_dir.LAST):
+            if (folder / name).is_file():
+                return folder / name
+        if not run_dir.is_run(path):
+            raise CheckpointError(f"checkpoint: the folder '{path}' is no run directory. Pass a file, a run, or last.")
+        raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint; its first epoch was never finished.")
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint: no file or run directory '{path}'. Pass a file, a run directory, or last.")
+    return path
+
+
+def read_plain(path: Path) -> dict[str, Any]:
+    """Read a file of plain types; anything else in it is refused unread.
+
+    Raises:
+        CheckpointError: if the file is damaged, holds code, or unpacks to more than its own size.
+    """
+    _check_archive(path)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"'{path}' is refused: it holds more than tensors and plain values, so loading it could run code. "
+            "Use a checkpoint written by hudepth-train."
+        ) from error
+    except Exception as error:
+        raise _damaged(path, error) from error
+    if not isinstance(content, dict):
+        raise CheckpointError(f"'{path}' holds no checkpoint, but a {type(content).__name__}.")
+    return content
+
+
+def _check_archive(path: Path) -> None:
+    """Refuse a damaged file before any of it is taken for code, and one that a reader would blow up in memory."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+            fits = unpacked <= path.stat().st_size  # torch.save does not compress
+            broken = archive.testzip() if fits else None
+    except Exception as error:  # zipfile knows a dozen ways in which a file can be broken
+        raise _damaged(path, error) from error
+    if not fits:
+        raise CheckpointError(
+            f"'{path}' is refused: it unpacks to more than its own size. Use a checkpoint written by hudepth-train."
+        )
+    if broken:
+        raise _damaged(path, zipfile.BadZipFile(f"'{broken}' has a wrong checksum"))
+
+
+def _damaged(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)}).")
+
+
+def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
+    """Find and read a checkpoint.
+
+    Args:
+        spec: a file, a run directory, or ``last``.
+        runs: where ``last`` looks.
+
+    Raises:
+        CheckpointError: if it is missing, damaged, holds code, or was not written by hudepth.
+    """
+    path = find_checkpoint(spec, runs=runs)
+    if bundles.is_bundle(path):
+        own, tensors, size_bytes = bundles.read_bundle(path)
+        epoch, run = own.get("epoch"), None
+    else:
+        content = read_plain(path)
+        if not isinstance(content.get(KEY), dict) or "state_dict" not in content:
+            raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
+        own, size_bytes = content[KEY], path.stat().st_size
+        tensors, run = content["state_dict"], run_dir.run_of(path.resolve())
+        epoch = content["epoch"] + 1 if isinstance(content.get("epoch"), int) else None
+    if own.get("version") != VERSION:
+        raise CheckpointError(f"'{path}' has checkpoint version {own.get('version')}; this hudepth reads {VERSION}.")
+    config, split, data = own.get("config"), own.get("split"), own.get("data")
+    if not (
+        isinstance(config, dict)
+        and isinstance(config.get("model"), dict)
+        and isinstance(split, dict)
+        and isinstance(data, dict)
+        and isinstance(epoch, int)
+        and _is_state(tensors)
+    ):
+        raise CheckpointError(
+            f"'{path}' is incomplete: its configuration, split, data, epoch or tensors are not there."
+        )
+    state = {n.removeprefix(NET_PREFIX): v for n, v in tensors.items() if n.startswith(NET_PREFIX)}
+    return Checkpoint(
+        path=path,
+        run=run,
+        config=config,
+        split=split,
+        data=data,
+        epoch=epoch,
+        state=state,
+        size_bytes=size_bytes,
+    )
+
+
+def _is_state(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(n, str) and isinstance(v, Tensor) for n, v in value.items())

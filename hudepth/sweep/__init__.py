@@ -1,0 +1,1 @@
+"""Multirun: sweeps and searches over configurations."""

@@ -1,0 +1,66 @@
+"""One job of a sweep: a training that keeps its words and its errors to its own run directory."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import os
+import traceback
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from hudepth.base.console import setup_logging
+from hudepth.base.machine import usable_cores
+from hudepth.base.wording import one_line
+from hudepth.runs import run_dir
+
+
+def run_job(cfg: DictConfig) -> None:
+    """Train as one job of a sweep.
+
+    Whatever fails is in the run's status and log, never raised: the other jobs go on. What a training prints goes to
+    its train.log; only warnings reach the terminal.
+
+    Args:
+        cfg: of the job, as for :func:`hudepth.training.command.train`.
+    """
+    path = Path(HydraConfig.get().runtime.output_dir)
+    path.mkdir(parents=True, exist_ok=True)
+    setup_logging(logging.WARNING, prefix=f"{path.name}: ")
+    train = importlib.import_module("hudepth.training.command").train
+    _share_machine(cfg)
+    try:
+        with (path / "train.log").open("a", encoding="utf-8") as log, contextlib.redirect_stdout(log):
+            train(cfg)
+    except run_dir.HeldError as error:  # not this process's run to call failed
+        logging.getLogger("hudepth").warning("%s", error)
+    except Exception as error:
+        _failed(path, error)
+
+
+def _failed(path: Path, error: Exception) -> None:
+    """Leave the line and the traceback in the run directory, whoever raised."""
+    line = one_line(error, "train")
+    status = run_dir.read_status(path)
+    with contextlib.suppress(OSError):  # a full disk: the launcher's process finds the run unfinished
+        if status.get("state") != "failed" or status.get("pid") != os.getpid():
+            with (path / "train.log").open("a", encoding="utf-8") as log:
+                log.write(traceback.format_exc())
+        run_dir.write_status(path, "failed", error=line)
+
+
+def _share_machine(cfg: DictConfig) -> None:
+    """Divide the cores among jobs that run side by side, and deal out the GPUs in turn."""
+    hydra = HydraConfig.get()
+    side_by_side = hydra.launcher.get("n_jobs")
+    if side_by_side in (None, 1):
+        return
+    import torch
+
+    torch.set_num_threads(max(1, usable_cores() // side_by_side) if side_by_side > 0 else 1)
+    gpus = torch.cuda.device_count()
+    if gpus > 1 and cfg.trainer.accelerator in ("auto", "gpu", "cuda"):
+        cfg.trainer.devices = [int(hydra.job.num) % gpus]

@@ -1,0 +1,1 @@
+"""hudepth-train: the module, its optimisation, and what happens around an epoch."""

@@ -1,0 +1,67 @@
+"""An exponential moving average of the weights, which validates, and is what checkpoints hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
+from torch import Tensor
+
+from hudepth.base.errors import ConfigError
+
+
+class EMA(WeightAveraging):
+    """Lightning's weight averaging with a decay that begins low, so that early epochs are not those of the first step.
+
+    With each step the average becomes ``d * average + (1 - d) * weights``, d = min(decay, (1 + n) / (10 + n)) after n
+    earlier steps; it begins with the weights of the first. Statistics of batch norm are averaged, too. The average
+    validates and draws, and is what ``best.ckpt`` holds; ``last.ckpt`` holds the weights beside it.
+
+    Args:
+        decay: in [0, 1); 0.998 averages over some 500 steps.
+
+    Raises:
+        ConfigError: if ``decay`` is out of range.
+    """
+
+    def __init__(self, *, decay: float = 0.998) -> None:
+        if not 0 <= decay < 1:
+            raise ConfigError(f"EMA.decay: {decay} is not in [0, 1). The usual values are 0.99 to 0.9999.")
+        self.decay = decay
+        super().__init__(multi_avg_fn=self._average)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Copy the network to where it is going to train; Lightning moves the network itself only later."""
+        self._device = trainer.strategy.root_device
+        super().setup(trainer, pl_module, stage)
+        if self._average_model is not None:
+            self._average_model.n_averaged = self._average_model.n_averaged.cpu()  # it is read at every step
+
+    @torch.no_grad()
+    def _average(self, averaged: Sequence[Tensor], current: Sequence[Tensor], count: Tensor | int) -> None:
+        steps = self._latest_update_step  # not ``count``, which lies on the device: reading it would wait for that
+        share = 1 - min(self.decay, (1 + steps) / (10 + steps))
+        if averaged[0].is_floating_point():
+            torch._foreach_lerp_(list(averaged), list(current), share)
+        else:  # counters
+            for mean, now in zip(averaged, current, strict=True):
+                mean.copy_(now)
+
+    def averaged_state(self) -> dict[str, Tensor]:
+        """Return the module's state with the averaged weights."""
+        assert self._average_model is not None
+        return dict(self._average_model.module.state_dict())
+
+
+def averaged_state(trainer: Trainer | None, checkpoint: dict[str, Any]) -> dict[str, Tensor] | None:
+    """Return the averaged weights that belong into a checkpoint that lacks them, or None.
+
+    Lightning hands checkpoints to the averaging callback unless they hold weights only, which ``best.ckpt`` does.
+    """
+    for callback in getattr(trainer, "callbacks", []):
+        if isinstance(callback, EMA) and callback._average_model is not None:
+            return None if "current_model_state" in checkpoint else callback.averaged_state()
+    return None

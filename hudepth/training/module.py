@@ -1,0 +1,216 @@
+"""The LightningModule: it joins network, loss and metrics, and holds no mathematics of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+from torchmetrics import MetricCollection
+
+from hudepth.base.errors import ConfigError, TrainingError
+from hudepth.base.types import Batch
+from hudepth.losses.distillation import Distillation
+from hudepth.metrics.collection import DepthMetrics, DepthSSIM
+from hudepth.metrics.depth import METRIC_NAMES
+from hudepth.runs import checkpoint as ckpt
+from hudepth.training.averaging import averaged_state
+from hudepth.training.schedules import StepSchedule
+
+LOTS = {"cpu": 1}
+"""After how many steps losses are looked at, by kind of device; else 50, since every look waits for the device."""
+
+
+class _Step(NamedTuple):
+    """A training step whose loss was not looked at yet."""
+
+    batch_idx: int
+    rows: Tensor
+    """Positions of its pairs in the depth store."""
+    total: Tensor
+    emptied: Tensor
+
+
+class DepthModule(LightningModule):
+    """Trains a depth network.
+
+    Logged, for ``train`` and ``val``: ``total`` and every raw term of the loss, as means over the epoch. For ``val``
+    also the metrics of section 3.5 in metres, and SSIM on unit depth (data range 1).
+
+    Args:
+        net: normalised image to unit depth.
+        loss: called with prediction, unit depth, image and valid mask; returns :class:`hudepth.base.types.LossTerms`.
+        max_depth_m: what unit depth 1 stands for.
+        optimizer: makes an optimiser from named parameters.
+        scheduler: makes a learning-rate schedule from an optimiser and the total number of steps: a
+            :class:`hudepth.training.schedules.StepSchedule` advances after every step, others after every epoch. None
+            for a constant rate.
+        distill: distance from a teacher's depths, added to the loss of training batches that bring some.
+        record: what each checkpoint carries beside the weights: ``config`` and ``split``, plain types only.
+    """
+
+    def __init__(
+        self,
+        net: nn.Module,
+        loss: nn.Module,
+        *,
+        max_depth_m: float,
+        optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
+        scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
+        distill: Distillation | None = None,
+        record: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.net = net
+        self.loss = loss
+        self.distill = distill
+        self.max_depth_m = max_depth_m
+        self.val_metrics = MetricCollection(
+            {"depth": DepthMetrics(), "ssim": DepthSSIM(data_range=max_depth_m)}, prefix="val/", compute_groups=False
+        )
+        self._make_optimizer, self._make_scheduler = optimizer, scheduler
+        self._record = record or {}
+        self._unchecked: deque[_Step] = deque()
+        self._emptied: list[_Step] = []  # in this epoch
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Predict unit depth from normalised images."""
+        prediction: Tensor = self.net(image)
+        return prediction
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Return the loss of a batch."""
+        total = self._step(batch, "train")
+        emptied = batch["emptied"] if "emptied" in batch else torch.zeros_like(total, dtype=torch.bool)
+        self._unchecked.append(_Step(batch_idx, batch["index"], total.detach(), emptied))
+        if len(self._unchecked) >= LOTS.get(total.device.type, 50):
+            self._check_pending()
+        return total
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Log the loss of a batch and add it to the metrics."""
+        self._step(batch, "val")
+
+    @torch.inference_mode()
+    def logged_names(self) -> list[str]:
+        """Return the names of all that is logged for an epoch; the loss is asked for its terms."""
+        depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
+        terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
+        return [
+            *(f"val/{name}" for name in (*METRIC_NAMES, "ssim", *terms)),
+            *(f"train/{name}" for name in (*terms, *(["distill"] if self.distill else []))),
+        ]
+
+    def _step(self, batch: Batch, stage: str) -> Tensor:
+        pred = self(batch.get("small_image", batch["image"]))
+        if pred.shape != batch["unit_depth"].shape:  # scored against the truth at full size, whatever size it trains at
+            pred = functional.interpolate(pred, batch["unit_depth"].shape[-2:], mode="bilinear", align_corners=False)
+        loss = self.loss(pred, batch["unit_depth"], batch["image"], batch["valid"])
+        total: Tensor = loss.total
+        terms = dict(loss.terms)
+        if self.distill is not None and "teacher" in batch:
+            terms["distill"] = self.distill(pred, batch["teacher"])
+            total = total + self.distill.weight * terms["distill"]
+        values = {f"{stage}/total": total.detach(), **{f"{stage}/{k}": v.detach() for k, v in terms.items()}}
+        # The batch size as a float: over processes Lightning averages the count of images in the count's own type, and
+        # of 7 images in two processes it would make 3 a process, which is a loss too high by a sixth.
+        size: Any = float(len(pred))
+        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True, batch_size=size)
+        if stage == "val":
+            depth_m = (x.float() * self.max_depth_m for x in (pred, batch["unit_depth"]))
+            self.val_metrics.update(*depth_m, batch["valid"])
+        return total
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics of the whole validation subset."""
+        self.log_dict({k: v.float() for k, v in self.val_metrics.compute().items()}, sync_dist=True)
+        self.val_metrics.reset()
+
+    def on_train_epoch_end(self) -> None:
+        """Check the losses that were not looked at yet, and what the last step left, before anything is saved."""
+        self._check_pending()
+        self._check_emptied()
+        finite = torch.stack([parameter.detach().isfinite().all() for parameter in self.net.parameters()]).all()
+        if not bool(finite):
+            raise TrainingError(
+                f"weights are no longer finite after epoch {self.current_epoch + 1} (step {self.trainer.global_step}). "
+                f"{self._last_good()} Lower optim.lr, or train with trainer.precision=32-true."
+            )
+
+    def _check_pending(self) -> None:
+        """Look at the losses of the steps that were not looked at yet."""
+        pending = list(self._unchecked)
+        self._unchecked.clear()
+        bad = [~step.total.isfinite() | step.emptied for step in pending]
+        if not bad or not bool(torch.stack(bad).any()):
+            return
+        for step in pending:
+            if not bool(step.total.isfinite()):
+                raise TrainingError(
+                    f"the loss is {step.total.item()} {self._where(step)}. {self._last_good()} "
+                    "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
+                )
+        self._emptied += [step for step in pending if bool(step.emptied)]
+
+    def _check_emptied(self) -> None:
+        """Stop if augmentation leaves most batches without truth; one of few measured pixels may lose them."""
+        emptied, batches = self._emptied, int(self.trainer.num_training_batches)
+        self._emptied = []
+        if 2 * len(emptied) > batches:
+            raise TrainingError(
+                f"augmentation left no measured pixel in {len(emptied)} of {batches} batches, first "
+                f"{self._where(emptied[0])}. Lower augment.zoom, augment.rotate_deg or augment.border, or raise "
+                "data.batch_size."
+            )
+
+    def _where(self, step: _Step) -> str:
+        store = getattr(getattr(self.trainer, "datamodule", None), "store", None)
+        names = ", ".join(store.records[i].id if store else str(i) for i in step.rows.tolist())
+        number = self.current_epoch * int(self.trainer.num_training_batches) + step.batch_idx + 1
+        return f"in epoch {self.current_epoch + 1}, batch {step.batch_idx} (step {number}), of the pairs {names}"
+
+    def _last_good(self) -> str:
+        """Tell where the last checkpoint is: it was written before anything became NaN."""
+        paths = [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]
+        if not paths:
+            return "No epoch was finished, so there is no checkpoint."
+        return f"The last good checkpoint is '{paths[-1]}', of epoch {self.current_epoch}."
+
+    def configure_optimizers(self) -> Any:
+        """Return the optimiser and, if there is one, the schedule."""
+        optimizer = self._make_optimizer(self.net.named_parameters())
+        if self._make_scheduler is None:
+            return optimizer
+        steps = self.trainer.estimated_stepping_batches  # infinite if nothing says how long the training is
+        scheduler = self._make_scheduler(optimizer, int(steps) if math.isfinite(steps) else 0)
+        interval = "step" if isinstance(scheduler, StepSchedule) else "epoch"
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
+
+    def on_train_start(self) -> None:
+        """Refuse to go on with a schedule that was laid out over another number of steps."""
+        scheduler = self.lr_schedulers() if self._make_scheduler else None
+        steps = self.trainer.estimated_stepping_batches
+        if isinstance(scheduler, StepSchedule) and scheduler.total_steps != steps:
+            raise ConfigError(
+                f"resume: the learning-rate schedule of this run is laid out over {scheduler.total_steps} steps, and "
+                f"now there would be {steps:g}. Leave trainer.accumulate_grad_batches, trainer.limit_train_batches and "
+                "the number of devices as they were, or start a new run."
+            )
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the configuration and the split, so that a checkpoint needs nothing beside it.
+
+        If weights are averaged, a checkpoint holds the average.
+        """
+        averaged = averaged_state(self._trainer, checkpoint)
+        if averaged is not None:
+            checkpoint["state_dict"] = averaged
+        checkpoint[ckpt.KEY] = {"version": ckpt.VERSION, **self._record}

@@ -1,0 +1,91 @@
+"""Continuing a run: its own configuration, with what was typed beside ``resume=`` on top."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.options import plain
+from hudepth.runs import run_dir
+from hudepth.runs.checkpoint import read_plain
+
+CHANGEABLE = (
+    "trainer.", "callbacks.", "logger.", "data.root", "data.num_workers", "data.prepare_workers", "distill.teacher",
+    "paths.", "test", "trust",
+)  # fmt: skip
+"""What may differ when a run goes on. All else is in its checkpoint or its split and would only seem to change."""
+
+PARTS = (
+    "seed",
+    "monitor",
+    "mode",
+    "data",
+    "model",
+    "loss",
+    "optim",
+    "schedule",
+    "trainer",
+    "callbacks",
+    "logger",
+    "protocol",
+)
+"""What the configuration of a run has."""
+
+
+def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
+    """Return the configuration of a run to continue, with what was typed beside ``resume=`` on top.
+
+    The run directory may be a stranger's, so it does not vouch for its own classes: only a typed ``trust=`` counts.
+
+    Args:
+        path: the run directory.
+        overrides: as typed, for example ``["resume=runs/x", "trainer.max_epochs=50"]``.
+
+    Raises:
+        CheckpointError: if it is no run, or has no checkpoint to continue from.
+        ConfigError: if something typed cannot change any more.
+    """
+    config = run_dir.read_config(path)
+    lacking = [part for part in PARTS if part not in config]
+    if lacking:
+        raise CheckpointError(f"resume: '{path}' is no run of hudepth-train: its config.yaml has no '{lacking[0]}'.")
+    last = path / run_dir.CHECKPOINTS / run_dir.LAST
+    if not last.is_file():
+        raise CheckpointError(f"resume: '{path}' has no finished epoch to continue from. Train anew, without resume=.")
+    read_plain(last)
+    epochs = config["trainer"].get("max_epochs")
+    resumed = OmegaConf.create({**config, "trust": []})
+    for override in overrides:
+        key, _, value = override.partition("=")
+        key = key.lstrip("+")
+        if key == "resume":
+            continue
+        found = OmegaConf.select(resumed, key, default=resumed)
+        if not key.startswith(CHANGEABLE) or OmegaConf.is_dict(found) or (found is resumed and key.count(".") != 1):
+            raise ConfigError(
+                f"resume: '{override}' cannot be changed when a run is continued; trainer.max_epochs and other "
+                "values of trainer, callbacks and logger can. Start a new run for anything else."
+            )
+        OmegaConf.update(resumed, key, OmegaConf.from_dotlist([f"value={value}"])["value"], force_add=True)
+    result = plain(resumed)
+    if result["trainer"].get("max_epochs") != epochs and (why := _bound_to_length(config)):
+        raise ConfigError(
+            f"resume: {why} of this run is laid out over {epochs} epochs, so trainer.max_epochs cannot change. "
+            "Start a new run, or use schedule=constant and data.progressive=null from the start."
+        )
+    return result
+
+
+def _bound_to_length(config: Mapping[str, Any]) -> str:
+    """Name the part of a run's configuration that depends on how long it trains, if there is one."""
+    schedule = config["schedule"] or {}
+    if "T_max" in schedule or str(schedule.get("_target_")).startswith("hudepth.training.schedules."):
+        return "the learning-rate schedule"
+    if config["data"].get("progressive"):
+        return "the progressive resolution"
+    freezes = [extra for extra in config["callbacks"].get("extra") or [] if "FreezeTrunk" in str(extra.get("_target_"))]
+    return "FreezeTrunk" if freezes else ""

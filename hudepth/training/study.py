@@ -1,0 +1,113 @@
+"""The part of a search that runs inside a training: it tells how each epoch went, and may stop it."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from hudepth.base.errors import ConfigError, Pruned
+from hudepth.training.callbacks import epoch_metrics
+
+if TYPE_CHECKING:
+    import optuna
+
+STUDY = "hudepth"
+TRIAL_ENV = "HUDEPTH_TRIAL"
+"""``<number>:<study file>``, in the environment of a job that is a trial."""
+
+
+class TrialPruner(Callback):
+    """Reports the monitored metric of each epoch to an optuna study, and ends the training if the study says so.
+
+    Args:
+        trial: the value of :data:`hudepth.training.study.TRIAL_ENV`.
+        monitor: the metric.
+    """
+
+    def __init__(self, trial: str, *, monitor: str) -> None:
+        import optuna
+
+        number, _, file = trial.partition(":")
+        study = open_study(file)
+        trial_id = next(each for each in study.get_trials(deepcopy=False) if each.number == int(number))._trial_id
+        self._trial = optuna.trial.Trial(study, trial_id)
+        self._reported = set(study.get_trials(deepcopy=False)[int(number)].intermediate_values)
+        self.monitor = monitor
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Report, and stop if others were better at this epoch.
+
+        Raises:
+            Pruned: to stop.
+        """
+        value = epoch_metrics(trainer).get(self.monitor)
+        epoch = trainer.current_epoch + 1
+        if value is None or not trainer.is_global_zero:
+            return
+        if epoch not in self._reported:  # a resumed run may come through an epoch again
+            self._trial.report(value, epoch)
+        if self._trial.should_prune():
+            raise Pruned(f"pruned after epoch {epoch}: {self.monitor} {value:.4f} is worse than others' then", value)
+
+
+def open_study(
+    file: str, options: Mapping[str, Any] | None = None, *, direction: str = "minimize"
+) -> optuna.study.Study:
+    """Open the study in a file that many processes may write to and a kill cannot damage; make it if there is none.
+
+    Args:
+        file: its path.
+        options: of the search, which are kept in the study; None: those that are.
+        direction: ``minimize`` or ``maximize``.
+
+    Raises:
+        ConfigError: if optuna is not installed, or the file is none of its own.
+    """
+    optuna_ = import_optuna()
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+
+    logging.getLogger("optuna").setLevel(logging.WARNING)
+    try:
+        if Path(file).is_file():  # optuna would add to any file
+            with Path(file).open(encoding="utf-8") as lines:
+                json.loads(next(lines, "{}"))
+        storage = JournalStorage(JournalFileBackend(file, lock_obj=JournalFileOpenLock(file)))
+        study: optuna.study.Study = optuna_.create_study(
+            storage=storage, study_name=STUDY, load_if_exists=True, direction=direction
+        )
+        if options is not None:
+            study.set_user_attr("options", dict(options))
+        chosen = study.user_attrs["options"]
+        # another seed for each trial: a study that goes on should not draw again what it drew at first
+        seed = int(chosen["seed"]) + len(study.get_trials(deepcopy=False))
+    except Exception as error:
+        why = " ".join(str(error).split())
+        raise ConfigError(f"search: '{file}' is no study that can go on ({why}). Pass another sweep_dir.") from error
+    pruners, samplers = optuna_.pruners, optuna_.samplers
+    startup, warmup = chosen["startup_trials"], chosen["warmup_epochs"]
+    study.pruner = pruners.MedianPruner(startup, warmup) if chosen["prune"] else pruners.NopPruner()
+    study.sampler = (
+        samplers.RandomSampler(seed=seed)
+        if chosen["sampler"] == "random"
+        else samplers.TPESampler(seed=seed, n_startup_trials=startup, constant_liar=True)
+    )
+    return study
+
+
+def import_optuna() -> Any:
+    """Return the optuna package.
+
+    Raises:
+        ConfigError: if it is not installed.
+    """
+    try:
+        import optuna
+    except ImportError:
+        raise ConfigError("search: optuna is not installed. Run pip install 'hudepth[search]'.") from None
+    return optuna

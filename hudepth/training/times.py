@@ -1,0 +1,92 @@
+"""What each epoch cost: times.csv of a run directory."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from hudepth.base.files import write_text
+from hudepth.base.types import Batch
+
+COLUMNS = ("epoch", "height", "width", "images", "wall_s", "cpu_s", "lr")
+
+
+class Times(Callback):
+    """Writes times.csv: one row an epoch, sums since training began.
+
+    =========  ==========================================================================================
+    column     meaning
+    =========  ==========================================================================================
+    epoch      from 1
+    height     of training images [pixels]
+    width      of training images [pixels]
+    images     training images seen so far, by all processes
+    wall_s     time since the start, validation, pictures and checkpoints included [s]
+    cpu_s      time of all cores in this process since the start; loader processes are not counted [s]
+    lr         learning rate of the optimiser's last group at the epoch's end
+    =========  ==========================================================================================
+
+    Times differ from run to run, so they are no part of the checkpoint: a run that goes on adds to the rows it finds.
+
+    Args:
+        path: the file to write.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[dict[str, str]] = []
+        self._wall = self._cpu = 0.0
+        self._images = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Begin, or go on after the rows of the epochs that are done."""
+        self.rows = [row for row in read_times(self.path) if int(row["epoch"]) <= trainer.current_epoch]
+        last = self.rows[-1] if self.rows else {"wall_s": "0", "cpu_s": "0", "images": "0"}
+        self._images = int(last["images"])
+        self._wall = time.monotonic() - float(last["wall_s"])
+        self._cpu = time.process_time() - float(last["cpu_s"])
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
+    ) -> None:
+        """Count the images."""
+        self._images += len(batch["index"]) * trainer.world_size
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the epoch's row."""
+        if not trainer.is_global_zero:
+            return
+        height, width = getattr(trainer, "datamodule", None).train_size  # type: ignore[union-attr]
+        values = (
+            trainer.current_epoch + 1, height, width, self._images,
+            f"{time.monotonic() - self._wall:.2f}", f"{time.process_time() - self._cpu:.2f}",
+            f"{trainer.optimizers[0].param_groups[-1]['lr']:.6g}",
+        )  # fmt: skip
+        self.rows.append({name: str(value) for name, value in zip(COLUMNS, values, strict=True)})
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_text(self.path, text.getvalue())
+
+
+def read_times(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a times.csv that are whole; none if it is missing or of another form."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [row for row in csv.DictReader(file) if _is_whole(row)]
+    except (OSError, ValueError):
+        return []
+
+
+def _is_whole(row: dict[str, str]) -> bool:
+    try:
+        _ = [float(row[name]) for name in COLUMNS], int(row["epoch"]), int(row["images"])
+    except (ValueError, KeyError, TypeError):
+        return False
+    return True

@@ -1,0 +1,129 @@
+"""Pictures as people have them, and as strangers make them."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hudepth.base.errors import DataError
+from hudepth.base.images import as_rgb, read_photo
+
+RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
+
+
+def encoded(image: Image.Image, kind: str = "PNG", **options: object) -> bytes:
+    file = io.BytesIO()
+    image.save(file, kind, **options)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["PNG", "BMP", "TIFF", "PPM", "GIF", "WEBP", "JPEG"])
+def test_formats(kind: str) -> None:
+    data = encoded(Image.fromarray(RGB), kind, **({"lossless": True} if kind == "WEBP" else {}))
+    photo = read_photo(data)
+    assert photo.rgb.shape == (12, 20, 3)
+    assert photo.rgb.dtype == np.uint8
+    if kind in ("PNG", "BMP", "TIFF", "PPM", "WEBP"):
+        assert (photo.rgb == RGB).all()
+    assert photo.notes == ()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_orientation_tag_is_honoured(orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    upright = read_photo(encoded(Image.fromarray(RGB), exif=exif)).rgb
+    turned = {  # EXIF 2.32, orientation: what brings the stored picture upright
+        1: RGB, 2: RGB[:, ::-1], 3: RGB[::-1, ::-1], 4: RGB[::-1], 5: RGB.transpose(1, 0, 2),
+        6: np.rot90(RGB, -1), 7: RGB.transpose(1, 0, 2)[::-1, ::-1], 8: np.rot90(RGB),
+    }[orientation]  # fmt: skip
+    assert (upright == turned).all()
+
+
+def test_grey_and_16_bit_and_palette_and_cmyk() -> None:
+    grey = RGB[..., 0]
+    assert (read_photo(encoded(Image.fromarray(grey))).rgb == grey[..., None]).all()
+    deep = grey.astype(np.uint16) * 257
+    for kind in ("PNG", "TIFF"):
+        assert (read_photo(encoded(Image.fromarray(deep), kind)).rgb == grey[..., None]).all()
+    palette = Image.fromarray(RGB).quantize(8)
+    assert (read_photo(encoded(palette)).rgb == np.asarray(palette.convert("RGB"))).all()
+    plain = Image.new("RGB", (8, 8), (200, 30, 30))
+    cmyk = read_photo(encoded(plain.convert("CMYK"), "JPEG")).rgb
+    assert np.abs(cmyk.astype(int) - (200, 30, 30)).max() < 6
+
+
+def test_what_is_transparent_is_white() -> None:
+    rgba = np.dstack([RGB, np.zeros(RGB.shape[:2], np.uint8)])
+    rgba[:, 10:, 3] = 255
+    for picture in (read_photo(encoded(Image.fromarray(rgba))).rgb, as_rgb(rgba)):
+        assert (picture[:, :10] == 255).all()
+        assert (picture[:, 10:] == RGB[:, 10:]).all()
+
+
+def test_of_an_animation_the_first_frame_is_taken_and_said_so() -> None:
+    frames = [Image.new("RGB", (8, 6), colour) for colour in ("red", "blue", "lime")]
+    photo = read_photo(encoded(frames[0], "GIF", save_all=True, append_images=frames[1:]))
+    assert photo.notes == ("animated, 3 frames: the first is taken",)
+    assert tuple(photo.rgb[0, 0]) == (255, 0, 0)
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A small PNG whose header claims many pixels."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    data = zlib.compress(bytes(1_000_000))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+JPEG = encoded(Image.fromarray(np.tile(RGB, (10, 10, 1))), "JPEG")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "x.png: the file is empty (0 bytes). Copy it again."),
+        (b"hello, I am a text", "x.png: no image that can be read. Pass a JPEG, PNG, WEBP, BMP, TIFF, GIF, PPM."),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "x.png: no image that can be read"),
+        (JPEG[: len(JPEG) // 2], "x.png: cannot be decoded, the file is truncated or damaged ("),
+        (JPEG[:60], "x.png: "),
+        (encoded(Image.fromarray(RGB))[:-30], "x.png: cannot be decoded, the file is truncated or damaged ("),
+        (bomb(10_001, 10_000), "x.png: 10001 x 10000 pixels, allowed are 1 to 100 million. Resize the file."),
+        (bomb(20_000, 20_000), "x.png: more pixels than are decoded here. Resize the file."),
+        (bomb(2**31 - 1, 2**31 - 1), "x.png: more pixels than are decoded here. Resize the file."),
+        (encoded(Image.fromarray(np.ones((4, 4), np.float32)), "TIFF"), "x.png: floating-point pixels have no known"),
+    ],
+    ids=["empty", "text", "eps", "half", "head", "png", "large", "huge", "absurd", "float"],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_bad_files_are_one_line(data: bytes, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        read_photo(data, where="x.png")
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "y.png").write_bytes(data)
+    with pytest.raises(DataError, match=re.escape(f"'{tmp_path / 'y.png'}': ")):
+        read_photo(tmp_path / "y.png")
+
+
+def test_a_file_that_is_not_there() -> None:
+    with pytest.raises(DataError, match=r"no file 'nowhere\.jpg'"):
+        read_photo("nowhere.jpg")
+
+
+@pytest.mark.parametrize(
+    "array", [np.zeros((3, 4, 2), np.uint8), np.zeros((3, 4, 3), np.float32), np.zeros(5, np.uint8)]
+)
+def test_arrays_that_are_no_image(array: np.ndarray) -> None:
+    with pytest.raises(DataError, match=r"image: an array of .* and shape .* Pass RGB as uint8"):
+        as_rgb(array)

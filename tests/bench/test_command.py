@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from hudepth.bench import backends
+from hudepth.bench.rows import Row
+from tests.commands import Command, script
+
+TINY = ("model=tiny", "size=[32,32]", "batches=[2,1]", "repeats=2", "seconds=0")
+
+
+def test_the_installed_script_measures_from_any_folder(tmp_path: Path, cache: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    arguments = (*TINY, "backends=[onnxruntime,default]", "output=there/bench", "threads=1")
+    done = subprocess.run(**script("bench", *arguments, cwd=tmp_path, cache=cache), check=False)  # type: ignore[call-overload]
+    assert done.returncode == 0, done.stdout
+    for text in ("TinyUNet, 32 x 32, threads: 1", "Fastest exact backend at batch 1: ", "Random weights:", "8,217"):
+        assert text in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]
+    folder = tmp_path / "there" / "bench"
+    assert sorted(path.name for path in folder.iterdir()) == ["bench.csv", "bench.json", "bench.md", "bench.png"]
+    content = json.loads((folder / "bench.json").read_text())
+    check_rows(content["rows"], folder / "bench.csv")
+    assert content["model"]["parameters"] == 8217
+    assert content["settings"]["batches"] == [1, 2]
+    assert content["machine"]["packages"]["onnxruntime"]
+    assert len(content["matmul_gflop_per_s"]["of_each_round"]) == 4
+    assert content["matmul_gflop_per_s"]["best"] == max(content["matmul_gflop_per_s"]["of_each_round"])
+    assert {len(entry["rounds"]) for entry in content["times_s"]} == {2}
+    page = (folder / "bench.md").read_text()
+    assert all(line in page for line in (*content["sentences"], *content["notes"]))
+    assert Image.open(folder / "bench.png").width > 500
+
+
+def check_rows(rows: list[dict[str, object]], table: Path) -> None:
+    names = [(row["batch"], row["contender"]) for row in rows]
+    assert names == [(batch, name) for batch in (1, 2) for name in ("eager", "default", "onnxruntime")]
+    with table.open(newline="") as file:
+        read = list(csv.DictReader(file))
+    assert [{key: str(value) for key, value in row.items()} for row in rows] == read
+    assert list(read[0]) == list(Row.__dataclass_fields__)
+    for row in rows:
+        assert isinstance(row["difference_mm"], float)
+        assert row["difference_mm"] < 0.1
+        assert row["peak_mb"] > 20  # type: ignore[operator]
+        assert row["passes"] == 2
+
+
+def test_a_checkpoint_is_measured_whatever_fails_beside_it(
+    trained: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = backends.Backend("hudepth.bench.torch_runners:absent", "broken")
+    gone = backends.Backend("hudepth.bench.graph_runners:OnnxRunner", "gone", packages=("absent",), extras="onnx")
+    monkeypatch.setitem(backends.BACKENDS, "compile", broken)
+    monkeypatch.setitem(backends.BACKENDS, "onnxruntime", gone)
+    arguments = ("backends=[compile,onnxruntime]", "batches=1", "repeats=1", "seconds=0")
+    done = command("bench", f"checkpoint={trained}", *arguments)
+    assert done.code == 0, done.err
+    content = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    model = content["model"]
+    assert (model["trained"], model["size"], model["max_depth_m"]) == (True, [32, 48], 10.0)
+    assert [row["contender"] for row in content["rows"]] == ["eager"]
+    installed, built = content["notes"][-2:]
+    assert installed == "onnxruntime: left out, since absent cannot be imported. Run pip install 'hudepth[onnx]'."
+    assert built.startswith("compile: cannot be built: AttributeError")
+    assert installed in " ".join(done.out.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("backends=[eger]",), "backends: no 'eger'. Did you mean 'eager'? Pass some of eager, channels_last,"),
+        (("batches=[0]",), "batches: [0] is no list of positive whole numbers. Pass batches=[1,4]."),
+        (("batches=[]",), "batches: [] is no list of positive whole numbers."),
+        (
+            ("peers=true", "peer_batches=[3]"),
+            "peer_batches: none of [3] is among batches=[1, 2]. Pass peer_batches=[1].",
+        ),
+        (("repeats=0",), "repeats: 0 is no whole number of at least 1."),
+        (("seconds=-1",), "seconds: -1 is no number of seconds. Leave it out for 1."),
+        (("longest_pass=0",), "longest_pass: 0 is no number of seconds. Leave it out for 10."),
+        (("threads=0",), "threads: 0 is no whole number of at least 1."),
+        (("size=[32]",), "size: [32] is not [height,width]. Pass size=[224,224]."),
+        (("size=[30,32]",), "multiple"),
+        (("device=tpu",), "device: no 'tpu' here. Pass device=cpu"),
+        (("checkpoint=last",), "checkpoint, model: both are set."),
+        (("output=/dev/null/x",), "output: cannot write to '/dev/null/x'"),
+        (("model.channels=x",), ""),
+        (("bakends=[eager]",), "no key 'bakends'. Did you mean 'backends'?"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(arguments: tuple[str, ...], line: str, command: Command) -> None:
+    done = command("bench", *TINY, *arguments)
+    assert done.code == 1
+    (said,) = done.err.splitlines()
+    assert said.startswith("hudepth-bench: ")
+    assert line in said
+
+
+def test_something_must_be_measured(command: Command) -> None:
+    done = command("bench")
+    line = "checkpoint, model: neither is set. Pass checkpoint=<file | run directory | last> or model=<name>."
+    assert done.err.strip() == f"hudepth-bench: {line}"
+    done = command("bench", "checkpoint=model.onnx")
+    assert "checkpoint: exported files are made here." in done.err
+
+
+def test_help_shows_how(command: Command) -> None:
+    done = command("bench", "--help")
+    assert done.code == 0
+    assert "hudepth-bench checkpoint=<model> | model=NAME" in done.out
+    assert "model       hybrid_unet" in done.out

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import importlib.util
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands import Command
+
+
+@pytest.mark.parametrize(
+    ("argument", "error"),
+    [
+        ("port=70000", "port: 70000 is above 65535. Leave it out for 7860, or pass 0 for any that is free."),
+        ("port=x", "port: x is no whole number of at least 0. Leave it out for 7860."),
+        ("max_upload_mb=0", "max_upload_mb: 0 is not above 0 and at most 1024. Leave it out for 20."),
+        ("max_pixels=0", "max_pixels: 0 is no whole number of at least 1. Leave it out for 40000000."),
+        ("max_pixels=200000000", "max_pixels: 200000000 is not from 1 to 100000000. Leave it out for 40000000."),
+        ("intrinsics=[1,2]", "intrinsics: [1, 2] is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the images."),
+        ("intrinsics=[0,1,2,3]", "intrinsics: [0.0,1.0,2.0,3.0] is no camera."),
+        ("fit=streched", "fit: no 'streched'. Did you mean 'stretch'?"),
+        ("prot=1", "no key 'prot'. Did you mean 'port'?"),
+    ],
+)
+def test_mistakes_are_answered_in_a_line(command: Command, argument: str, error: str) -> None:
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    result = command("demo", "checkpoint=model.ckpt", "port=0", argument) if "port" not in argument else command(
+        "demo", "checkpoint=model.ckpt", argument
+    )  # fmt: skip
+    assert result.code == 1
+    assert result.err.startswith(f"hudepth-demo: {error}")
+    assert result.err.count("\n") == 1
+
+
+def test_without_gradio_it_says_how_to_get_it(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    find: Any = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "gradio" else find(name))
+    result = command("demo", "checkpoint=model.ckpt")
+    assert result.code == 1
+    assert result.err == "hudepth-demo: gradio is not installed. Run pip install 'hudepth[demo]'.\n"
+
+
+def test_a_port_that_is_taken_is_said_before_anything_is_loaded(command: Command) -> None:
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        result = command("demo", "checkpoint=model.ckpt", f"port={port}")
+    assert result.code == 1
+    assert result.err.startswith(f"hudepth-demo: port: 127.0.0.1:{port} cannot be had (")
+    assert "port=0" in result.err
+
+
+def test_a_checkpoint_must_be_there(command: Command, tmp_path: Path) -> None:
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    assert "none.ckpt" in command("demo", "checkpoint=none.ckpt", "port=0").err
+
+
+def test_help_needs_no_model(command: Command) -> None:
+    result = command("demo", "--help")
+    assert result.code == 0
+    assert "hudepth-demo checkpoint=last" in result.out

@@ -1,0 +1,190 @@
+"""hudepth-predict, from the command line to the files."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+import hudepth
+from hudepth.inference import video
+from tests.commands import Command, script
+
+RANDOM = np.random.default_rng(0)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    Image.fromarray(RANDOM.integers(0, 256, (48, 64, 3), dtype=np.uint8)).save(folder / "a.png")
+    Image.fromarray(RANDOM.integers(0, 256, (90, 50), dtype=np.uint8)).save(folder / "grey tall.jpg")
+    Image.fromarray(RANDOM.integers(0, 256, (20, 80, 4), dtype=np.uint8)).save(folder / "wide.webp")
+    return folder
+
+
+def film(path: Path, count: int, *, codec: str = "MJPG") -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 12, (64, 48))
+    for number in range(count):
+        writer.write(np.full((48, 64, 3), 9 * number % 256, np.uint8))
+    writer.release()
+
+
+def test_a_folder_by_the_installed_script(trained: Path, photos: Path, tmp_path: Path, cache: Path) -> None:
+    arguments = (f"checkpoint={trained}", "input=photos", "formats=[png16,npy,colour,side,ply]")
+    done = subprocess.run(**script("predict", *arguments, cwd=tmp_path, cache=cache), check=False)
+    assert done.returncode == 0, done.stdout
+    assert "model: TinyUNet of" in done.stdout
+    assert "3 predicted in" in done.stdout
+    out = tmp_path / "predictions"
+    model = hudepth.load(trained)
+    for name in ("a.png", "grey tall.jpg", "wide.webp"):
+        stem = Path(name).stem
+        metres = np.load(out / f"{stem}_depth.npy")
+        assert metres.dtype == np.float32
+        assert np.abs(metres - model.predict(photos / name).metres).max() < 1e-5
+        millimetres = cv2.imread(str(out / f"{stem}_depth.png"), cv2.IMREAD_UNCHANGED)
+        assert np.abs(millimetres / 1000 - metres).max() <= 0.0005 + 1e-6
+        with Image.open(photos / name) as image, Image.open(out / f"{stem}_depth.jpg") as coloured:
+            assert metres.shape == (image.height, image.width)
+            assert coloured.height == image.height
+            assert coloured.width > image.width
+        assert (out / f"{stem}_depth.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
+        assert (out / f"{stem}_side.jpg").exists()
+    stated = json.loads((out / "predictions.json").read_text())
+    assert stated["units"] == {"png16": "mm", "npy": "m", "ply": "m"}
+    assert stated["network_size"] == [32, 48]
+    assert stated["model"]["source"] == "rooms"
+    assert (stated["predicted"], stated["failed"], stated["fit"]) == (3, {}, "stretch")
+
+
+def test_what_is_bad_is_listed_and_the_rest_is_done(trained: Path, photos: Path, command: Command) -> None:
+    whole = (photos / "a.png").read_bytes()
+    (photos / "empty.png").write_bytes(b"")
+    (photos / "cut.png").write_bytes(whole[: len(whole) // 2])
+    (photos / "text.jpg").write_text("no image")
+    film(photos / "cut.avi", 40)
+    film_bytes = (photos / "cut.avi").read_bytes()
+    (photos / "cut.avi").write_bytes(film_bytes[: len(film_bytes) // 2])
+    done = command("predict", f"checkpoint={trained}", "input=photos", "formats=[npy]", "output=out")
+    assert done.code == 1
+    for line in ("empty.png': the file is empty", "cut.png': cannot be decoded", "text.jpg': no image that"):
+        assert line in done.err
+    assert "cut.avi': ends after" in done.err
+    last = done.err.splitlines()[-1]
+    assert last.startswith("hudepth-predict: 4 of ")
+    assert last.endswith(" could not be predicted, see above; the rest is in 'out'.")
+    assert sorted(file.name for file in Path("out").glob("*.npy")) == [
+        "a_depth.npy",
+        "grey tall_depth.npy",
+        "wide_depth.npy",
+    ]
+    assert len(list(Path("out/cut_avi").glob("*.npy"))) > 5  # cut.png would have been "cut", too
+    assert set(json.loads(Path("out/predictions.json").read_text())["failed"]) == {
+        f"photos/{name}" for name in ("empty.png", "cut.png", "text.jpg", "cut.avi")
+    }
+
+
+def test_a_video_becomes_a_video(trained: Path, tmp_path: Path, command: Command) -> None:
+    film(tmp_path / "walk.mp4", 20, codec="mp4v")
+    formats = "formats=[colour,side,png16]"
+    done = command("predict", f"checkpoint={trained}", "input=walk.mp4", formats, "smoothing=0.5", "output=out")
+    assert done.code == 0, done.err
+    for name, wider in (("walk_depth.mp4", 1), ("walk_side.mp4", 2)):
+        reader = video.FrameReader(tmp_path / "out" / name)
+        frames = list(reader)
+        assert len(frames) == 20
+        assert reader.rate == pytest.approx(12)
+        assert frames[0].shape[0] == 48
+        assert frames[0].shape[1] > 64 * wider
+    assert len(list((tmp_path / "out" / "walk").glob("*_depth.png"))) == 20
+
+
+def test_a_camera_writes_frames(
+    trained: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No camera is needed: a film stands in for it."""
+    film(tmp_path / "film.avi", 30)
+    opened = cv2.VideoCapture
+    monkeypatch.setattr(
+        cv2, "VideoCapture", lambda source: opened(str(tmp_path / "film.avi") if source == 0 else source)
+    )
+    done = command("predict", f"checkpoint={trained}", "input=0", "frames=5", "output=out")
+    assert done.code == 0, done.err
+    assert sorted(file.name for file in (tmp_path / "out" / "camera0").iterdir()) == sorted(
+        f"{frame:06d}_depth.{kind}" for frame in range(5) for kind in ("png", "jpg")
+    )
+
+
+def test_letterbox_and_size_and_scale(trained: Path, photos: Path, command: Command) -> None:
+    done = command(
+        "predict", f"checkpoint={trained}", "input=photos/wide.webp", "fit=letterbox", "size=[64,96]",
+        "formats=[npy,colour]", "scale_m=[1,4]", "output=out",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    expected = hudepth.load(trained, fit="letterbox", size=(64, 96)).predict(photos / "wide.webp").metres
+    np.testing.assert_allclose(np.load("out/wide_depth.npy"), expected, atol=1e-5)
+    stated = json.loads(Path("out/predictions.json").read_text())
+    assert (stated["fit"], stated["network_size"], stated["scale_m"]) == ("letterbox", [64, 96], [1, 4])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("input=nowhere",), "input: no file, folder or match 'nowhere'. Pass an image, folder, 'pattern', video"),
+        (("formats=[png]",), "formats: no 'png'. Did you mean 'png16'? Pass some of png16, npy, colour, side, ply."),
+        (("formats=[]",), "formats: none is given. Pass some of png16, npy, colour, side, ply."),
+        (("smoothing=1",), "smoothing: 1 is no share from 0 to less than 1. Pass smoothing=0.6, or 0 for none."),
+        (("scale_m=[4,1]",), "scale_m: [4, 1] is not two rising distances in metres. Pass scale_m=[0,10]."),
+        (("intrinsics=[1,2,3]",), "intrinsics: [1, 2, 3] is not [fx,fy,cx,cy]. Pass four numbers, in pixels"),
+        (("size=[30,48]",), "data.size: images of 30 x 48 (height x width), but both sides must be multiples of 16."),
+        (("size=224",), "size: 224 is not [height,width]. Pass size=[224,224]."),
+        (("fit=crop",), "fit: no 'crop'. Pass one of stretch, letterbox."),
+        (("frames=0",), "frames: 0 is no whole number of at least 1."),
+        (("threads=0",), "threads: 0 is less than 1."),
+        (("output=photos",), "output: 'photos' is the folder of the input. Pass another, output=<folder>."),
+        (("output=taken",), "output: cannot write to 'taken' (File exists). Pass output=<a folder>."),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line(
+    arguments: tuple[str, ...], message: str, trained: Path, photos: Path, command: Command
+) -> None:
+    Path("taken").write_text("")
+    done = command("predict", f"checkpoint={trained}", "input=photos", *arguments)
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith(f"hudepth-predict: {message}")
+
+
+def test_a_disk_that_fills_up(trained: Path, photos: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hudepth.inference.command.write_depth", full)
+    done = command("predict", f"checkpoint={trained}", "input=photos", "output=out")
+    assert done.code == 1
+    assert "hudepth-predict: output: cannot write to 'out' (No space left on device); 3 were predicted." in done.err
+
+
+def test_what_predict_sees_is_what_test_sees(trained: Path, cache: Path, command: Command, tmp_path: Path) -> None:
+    """The very pixels of a prepared pair give the very prediction of the network on the stored image."""
+    import torch
+
+    from hudepth.base.normalise import normalise_image
+    from hudepth.data.pairs import prepare_pair
+    from hudepth.data.sources.rooms import RoomsSource
+    from hudepth.runs.checkpoint import load_checkpoint
+
+    source = RoomsSource(scenes=1, frames_per_scene=1, size=(48, 64))
+    record = source.records()[0]
+    pair, image = prepare_pair(source, record, (32, 48), native=False), source.read(record).image
+    net = load_checkpoint(str(trained)).build_net(trust=[])
+    with torch.inference_mode():
+        stored = normalise_image(torch.from_numpy(pair.image).permute(2, 0, 1)[None] / 255)
+        expected = net(stored)[0, 0].numpy() * 10
+    resized = cv2.resize(expected, (64, 48), interpolation=cv2.INTER_LINEAR)
+    assert np.abs(hudepth.load(trained).predict(image).metres - resized).max() < 1e-4

@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import json
+import string
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hudepth.runs import run_dir
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.runs.sweeps import folder_name, identity, read_jobs, read_sweep, run_key, write_jobs
+
+CONFIG: dict[str, Any] = {
+    "name": "x", "seed": 1, "monitor": "val/abs_rel", "test": True, "variant": None, "protocol": {"paper": {}},
+    "data": {"root": "a", "cache": "b", "size": [224, 224], "seed": 1, "batch_size": 8},
+    "model": {"weights": "imagenet"}, "loss": {"_target_": "L1"}, "paths": {"runs": "runs"},
+    "trainer": {"max_epochs": 4, "devices": 1, "accelerator": "cpu"}, "callbacks": {"panels": 6, "extra": []},
+}  # fmt: skip
+
+
+def changed(key: str, value: Any) -> dict[str, Any]:
+    config = json.loads(json.dumps(CONFIG))
+    part, _, name = key.rpartition(".")
+    (config[part] if part else config)[name] = value
+    return dict(config)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("name", "y"), ("test", False), ("baselines", False), ("variant", "l1"), ("protocol", {"eigen": {}}),
+        ("sweep_dir", "s"), ("data.root", "/elsewhere"), ("data.cache", "/c"), ("data.num_workers", 4),
+        ("paths.runs", "other"), ("trainer.devices", [1]), ("trainer.accelerator", "gpu"), ("callbacks.panels", 0),
+    ],
+)  # fmt: skip
+def test_where_and_how_it_runs_does_not_make_another_training(key: str, value: Any) -> None:
+    assert run_key(changed(key, value)) == run_key(CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("seed", 2), ("data.seed", 2), ("data.size", [112, 112]), ("model.weights", "none"), ("loss._target_", "L2"),
+        ("trainer.max_epochs", 5), ("callbacks.extra", [1]), ("data.split_seed", 1), ("monitor", "val/rmse"),
+    ],
+)  # fmt: skip
+def test_what_is_trained_does(key: str, value: Any) -> None:
+    assert run_key(changed(key, value)) != run_key(CONFIG)
+
+
+def test_one_is_one_however_it_is_written() -> None:
+    assert run_key(changed("loss.boundary", 1)) == run_key(changed("loss.boundary", 1.0))
+    assert run_key(changed("data.size", [224.0, 224])) == run_key(CONFIG)
+    assert run_key(changed("loss.x", True)) != run_key(changed("loss.x", 1))
+    assert run_key(changed("loss.x", "1")) != run_key(changed("loss.x", 1))
+
+
+def test_identity_has_dotted_keys_in_order() -> None:
+    keys = list(identity(CONFIG))
+    assert keys == sorted(keys)
+    assert "trainer.max_epochs" in keys
+    assert not {"name", "data.root", "paths.runs"} & set(keys)
+
+
+@given(st.dictionaries(st.text(string.printable, max_size=20), st.text(max_size=200), max_size=4))
+def test_a_folder_is_one_plain_word(labels: dict[str, str]) -> None:
+    name = folder_name(labels, "0123456789")
+    assert name.endswith("0123456789")
+    assert len(name) <= 91
+    assert not set(name) & set("/\\ ,='\"$*?[](){}<>|;&\n\0")
+    assert name[0] not in ".-"
+
+
+def test_a_folder_says_what_was_varied() -> None:
+    assert folder_name({"variant": "l1", "seed": "1"}, "k") == "l1_seed-1-k"
+    assert folder_name({"loss.boundary": "3.0", "model": "tiny"}, "k") == "boundary-3.0_model-tiny-k"
+    assert folder_name({}, "k") == "k"
+
+
+def make_run(folder: Path, name: str, *, state: str | None = "finished", error: str = "") -> Path:
+    run = folder / name
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(yaml.safe_dump(CONFIG))
+    if state:
+        run_dir.write_status(run, state, **({"error": error} if error else {}))
+    return run
+
+
+def test_a_sweep_is_read_in_its_order_and_what_is_no_run_is_noted(tmp_path: Path) -> None:
+    for name, state, error in (
+        ("b", "finished", ""),
+        ("a", "failed", "no memory"),
+        ("new", "running", ""),
+        ("none", None, ""),
+    ):
+        make_run(tmp_path, name, state=state, error=error)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "config.yaml").write_text("data: {")
+    (tmp_path / "odd").mkdir()
+    (tmp_path / "odd" / "config.yaml").write_text("a: 1")
+    (tmp_path / ".hidden").mkdir()
+    (tmp_path / "notes.txt").touch()
+    jobs = [{"labels": {"v": name}, "run": name} for name in ("b", "gone", "a")]
+    write_jobs(tmp_path, "x", [*jobs, {"labels": {"v": "bad"}, "error": "no key"}])
+    sweep = read_sweep(tmp_path)
+    assert [(run.path.name, run.state, run.error, run.labels) for run in sweep.runs] == [
+        ("b", "finished", "", {"v": "b"}),
+        ("a", "failed", "no memory", {"v": "a"}),
+        ("new", "interrupted", "", {}),  # nobody holds it: it was killed
+        ("none", "interrupted", "", {}),
+    ]
+    assert sweep.uncomposed == [({"v": "bad"}, "no key")]
+    foreign, half, odd = (next(n for n in sweep.notes if f"/{name}'" in n) for name in ("foreign", "half", "odd"))
+    assert foreign.startswith(f"left alone: '{tmp_path}/foreign' is no run directory: its config.yaml cannot be read (")
+    assert half.startswith(f"left alone: '{tmp_path}/half' is no run directory: its config.yaml cannot be read (")
+    assert odd == f"left alone: '{tmp_path}/odd' is no run of hudepth-train: its config.yaml has no 'seed'"
+    assert [note for note in sweep.notes if "gone" in note] == [
+        "'gone' has not begun: sweep.yaml names it, and there is no such folder"
+    ]
+
+
+def test_a_run_that_is_held_is_running(tmp_path: Path) -> None:
+    run = make_run(tmp_path, "a", state="running")
+    with run_dir.held(run):
+        assert read_sweep(tmp_path).runs[0].state == "running"
+        with pytest.raises(
+            ConfigError, match=r"^'.*/a' is being worked on by another process \(number \d+\)\. Wait for"
+        ):
+            run_dir.held(run).__enter__()
+    assert read_sweep(tmp_path).runs[0].state == "interrupted"
+
+
+def test_one_of_several_sweeps_in_a_folder(tmp_path: Path) -> None:
+    for name in "abc":
+        make_run(tmp_path, name)
+    write_jobs(tmp_path, "x", [{"labels": {"v": "1"}, "run": "a"}, {"labels": {"v": "2"}, "run": "b"}])
+    write_jobs(tmp_path, "y", [{"labels": {"v": "paper"}, "run": "b"}, {"labels": {"v": "3"}, "run": "c"}])
+    assert [run.labels["v"] for run in read_sweep(tmp_path, name="y").runs] == ["paper", "3"]
+    assert [run.labels["v"] for run in read_sweep(tmp_path).runs] == ["1", "2", "3"]  # each run once, as first called
+    with pytest.raises(DataError, match=r"^name: no sweep 'z' in '.*'\. It holds x, y\.$"):
+        read_sweep(tmp_path, name="z")
+
+
+def test_any_folder_of_runs_will_do(tmp_path: Path) -> None:
+    make_run(tmp_path, "a")
+    sweep = read_sweep(tmp_path)
+    assert [run.labels for run in sweep.runs] == [{}]
+    assert sweep.notes == []
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "- 1", "sweeps: 3", "sweeps: {x: [{}]}", "sweeps: {x: [{labels: {}, run: ../a}]}"]
+)
+def test_a_damaged_list_costs_labels_and_not_runs(text: str, tmp_path: Path) -> None:
+    make_run(tmp_path, "a")
+    (tmp_path / "sweep.yaml").write_text(text)
+    sweep = read_sweep(tmp_path)
+    assert [run.path.name for run in sweep.runs] == ["a"]
+    assert sweep.notes[0].startswith(f"'{tmp_path}/sweep.yaml' cannot be read (")
+    write_jobs(tmp_path, "x", [{"labels": {}, "run": "a"}])
+    assert (tmp_path / "sweep.yaml.damaged").read_text() == text
+    assert read_jobs(tmp_path) == {"x": [{"labels": {}, "run": "a"}]}
+
+
+def test_jobs_are_added_and_none_is_lost(tmp_path: Path) -> None:
+    bad = {"labels": {"v": "2"}, "error": "no key"}
+    write_jobs(tmp_path, "x", [{"labels": {"v": "1"}, "run": "a"}, bad])
+    write_jobs(tmp_path, "x", [{"labels": {"v": "3"}, "run": "c"}, {"labels": {"v": "1"}, "run": "a"}])
+    assert [job["labels"]["v"] for job in read_jobs(tmp_path)["x"]] == ["1", "2", "3"]
+    write_jobs(tmp_path, "x", [{"labels": {"v": "2"}, "run": "b"}])
+    assert [job.get("run") for job in read_jobs(tmp_path)["x"]] == ["a", "c", "b"]
+
+
+@pytest.mark.parametrize(("made", "message"), [(False, "no folder"), (True, "holds no run")])
+def test_an_empty_sweep_gives_one_line(made: bool, message: str, tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    if made:
+        (folder / "foreign").mkdir(parents=True)
+    with pytest.raises(DataError, match=rf"^dir: .*{message}.* Pass dir=<folder of a sweep>") as caught:
+        read_sweep(folder)
+    assert ("(1 other folders lie in it)" in str(caught.value)) == made
