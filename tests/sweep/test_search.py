@@ -21,8 +21,8 @@ from hudepth.sweep.search import check_options, distribution
 from hudepth.training.study import TrialPruner, open_study
 from tests.commands import Command, script
 
-from .test_sweeper import FAST, runs, states
 from .test_kill import start, wait_for
+from .test_sweeper import FAST, runs, states
 
 OPTIONS = yaml.safe_load((conf_folder() / "hydra/sweeper/hudepth.yaml").read_text())["search"]
 SPACE = "loss.boundary=tag(log,interval(0.3,30))"
