@@ -1,0 +1,120 @@
+"""One table, written for a terminal, as Markdown, CSV or LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+LOG_WIDTH = 130
+"""Columns of a table that does not go to a terminal: a log should not wrap what a wide terminal would show."""
+_LATEX = {c: f"\\{c}" for c in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"\(\uparrow\)",
+    "↓": r"\(\downarrow\)", "±": r"\(\pm\)", "−": r"\(-\)", "≥": r"\(\geq\)", "²": r"\(^2\)",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Text of a cell; a plain string serves where it has no style."""
+
+    text: str
+    bold: bool = False
+    dim: bool = False
+
+
+@dataclass
+class Table:
+    """Rows under named columns. Cells are strings or :class:`Cell`; a line break in one makes it taller."""
+
+    columns: Sequence[str]
+    rows: list[Sequence[str | Cell]] = field(default_factory=list)
+    title: str = ""
+    caption: str = ""
+    """Below the table."""
+    left: int = 1
+    """How many columns, from the first on, are aligned to the left."""
+
+    def add(self, *cells: str | Cell) -> None:
+        """Append a row."""
+        self.rows.append(cells)
+
+    def to_markdown(self) -> str:
+        """Return a Markdown table; title and caption are not part of it."""
+        rule = "|" + "".join("---|" if i < self.left else "---:|" for i in range(len(self.columns)))
+        lines = [_markdown_row(self.columns), rule, *(_markdown_row(row) for row in self.rows)]
+        return "\n".join(lines) + "\n"
+
+    def to_csv(self) -> str:
+        """Return comma-separated values with a header."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([_cell(cell).text for cell in row] for row in self.rows)
+        return text.getvalue()
+
+    def to_latex(self) -> str:
+        """Return a ``tabular`` for the booktabs package."""
+        align = "l" * self.left + "r" * (len(self.columns) - self.left)
+        lines = [rf"\begin{{tabular}}{{{align}}}", r"\toprule", _latex_row(self.columns), r"\midrule"]
+        return "\n".join([*lines, *(_latex_row(row) for row in self.rows), r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+    def to_rich(self, **style: Any) -> RichTable:
+        """Return a table for rich; ``style`` goes to its constructor."""
+        from rich.markup import escape
+        from rich.table import Table as Rich
+
+        table = Rich(
+            title=escape(self.title) or None, caption=escape(self.caption) or None,
+            title_justify="left", caption_justify="left", **style,
+        )  # fmt: skip
+        for i, name in enumerate(self.columns):
+            table.add_column(escape(name), justify="left" if i < self.left else "right", no_wrap=i >= self.left)
+        for row in self.rows:
+            table.add_row(*(_rich(_cell(cell)) for cell in row))
+        return table
+
+    def show(self, **style: Any) -> None:
+        """Print to standard output."""
+        stdout().print(self.to_rich(**style))
+
+
+def stdout() -> Console:
+    """Return a console for results: as wide as the terminal, or :data:`LOG_WIDTH` where there is none."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=LOG_WIDTH)
+
+
+def _cell(cell: str | Cell) -> Cell:
+    return cell if isinstance(cell, Cell) else Cell(cell)
+
+
+def _rich(cell: Cell) -> str:
+    from rich.markup import escape
+
+    text = escape(cell.text)
+    return f"[bold]{text}[/]" if cell.bold else f"[dim]{text}[/]" if cell.dim else text
+
+
+def _markdown_row(cells: Iterable[str | Cell]) -> str:
+    def text(cell: Cell) -> str:
+        escaped = cell.text.replace("|", "&#124;").replace("\n", " ")
+        return f"**{escaped}**" if cell.bold else escaped
+
+    return f"| {' | '.join(text(_cell(cell)) for cell in cells)} |"
+
+
+def _latex_row(cells: Iterable[str | Cell]) -> str:
+    def text(cell: Cell) -> str:
+        escaped = "".join(_LATEX.get(c, c) for c in cell.text.replace("\n", " "))
+        return rf"\textbf{{{escaped}}}" if cell.bold else escaped
+
+    return " & ".join(text(_cell(cell)) for cell in cells) + r" \\"
