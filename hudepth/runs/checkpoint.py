@@ -12,10 +12,10 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
-from hudepth.runs import bundles, run_dir
 from hudepth.base.errors import CheckpointError, TrainingError
 from hudepth.base.files import written_whole
 from hudepth.base.instantiate import instantiate
+from hudepth.runs import bundles, run_dir
 
 KEY = "hudepth"
 """Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""

@@ -21,9 +21,9 @@ from typing import Any
 
 import yaml
 
-from hudepth.runs import run_dir
 from hudepth.base.errors import DataError, HudepthError, did_you_mean
 from hudepth.base.files import read_yaml, write_text
+from hudepth.runs import run_dir
 from hudepth.runs.results import flat
 
 SWEEP_FILE = "sweep.yaml"

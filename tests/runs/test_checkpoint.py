@@ -20,14 +20,14 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 from torch import Tensor, nn
 
-from hudepth.training.callbacks import History, checkpoint_callbacks
-from hudepth.runs.checkpoint import KEY, VERSION, AtomicCheckpointIO, find_checkpoint, load_checkpoint, read_plain
-from hudepth.data.datamodule import DepthDataModule
-from hudepth.data.sources.rooms import RoomsSource
 from hudepth.base.errors import CheckpointError, ConfigError, TrainingError
 from hudepth.base.files import write_text
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.sources.rooms import RoomsSource
 from hudepth.losses import BADCL
 from hudepth.models import HybridUNet, TinyUNet
+from hudepth.runs.checkpoint import KEY, VERSION, AtomicCheckpointIO, find_checkpoint, load_checkpoint, read_plain
+from hudepth.training.callbacks import History, checkpoint_callbacks
 from hudepth.training.module import DepthModule
 
 MODEL = {"_target_": "hudepth.models.TinyUNet", "channels": 4}

@@ -14,9 +14,9 @@ import pytest
 import torch
 import yaml
 
-from hudepth.runs import run_dir
 from hudepth.base.console import log
 from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.runs import run_dir
 
 
 class FixedClock(datetime):

@@ -10,8 +10,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.runs import run_dir
 from hudepth.base.errors import ConfigError, DataError
+from hudepth.runs import run_dir
 from hudepth.runs.sweeps import folder_name, identity, read_jobs, read_sweep, run_key, write_jobs
 
 CONFIG: dict[str, Any] = {
