@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help install demo test lint format clean
+.PHONY: help install demo ledger test lint format clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -19,6 +19,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 demo: $(INSTALLED)  ## train and test a first model on built-in rooms, in under 3 minutes
 	$(BIN)/hudepth-train +experiment=demo
+
+ledger: $(INSTALLED)  ## check every claim of the paper; ARGS="--runs DIR ..." adds runs as evidence
+	$(BIN)/python -m experiments.ledger $(ARGS)
 
 test: $(INSTALLED)  ## run all tests
 	$(BIN)/python -m pytest -n auto --dist loadfile

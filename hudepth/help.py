@@ -59,8 +59,6 @@ EXAMPLES = {
         ("hudepth-report table runs=[A,B,C] protocol=[paper,eigen]", "results side by side, and in what they differ"),
         ("hudepth-report sweep dir=sweeps/losses/A", "a sweep's variants over their seeds: tables, plots, one page"),
         ("hudepth-report figures run=last", "loss curves and RGB / truth / prediction panels of a run"),
-        ("hudepth-report paper", "what the paper claims beside what is measured here and now"),
-        ("hudepth-report paper runs=[A,B]", "with runs of yours as evidence"),
     ),
     "predict": (
         (

@@ -60,8 +60,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shortened(command: str) -> list[str]:
     """Return the command with what makes it run in seconds and without a network."""
     words = command.split()
-    if words[:2] == ["hudepth-report", "paper"]:
-        return [*words, "throughput=false"]
     if words[0] == "hudepth-bench":
         return [*words, "backends=[default]", "batches=[1]", "repeats=1", "seconds=0"]
     if words[0] == "hudepth-export":  # tests/tasks/test_export.py makes all formats

@@ -27,7 +27,7 @@ def markdown(rows: Sequence[Row], *, table_2: Sheet, runs: Sequence[Run], enviro
         runs: what was given as evidence.
         environment: versions, device and the command.
     """
-    command = " ".join(map(str, environment.get("command", ["hudepth-report", "paper"]))).replace(" verb=", " ")
+    command = " ".join(environment["command"])
     parts = [
         f"# What the paper claims, and what is measured\n\nThe paper: {CITATION}. Every figure under *measured* was "
         f"computed by `{command}` when it ran, or read from the runs listed at the end; only what stands under *the "
@@ -108,7 +108,7 @@ def _sheet(sheet: Sheet) -> str:
 
 def _runs(runs: Sequence[Run]) -> str:
     if not runs:
-        return "## Runs\n\nNone were given: pass `runs=[<run directory>,...]`."
+        return "## Runs\n\nNone were given: pass `--runs <run directory> ...`."
     lines = [f"- {run.name}: `{run.path}`" + "".join(f"\n  - problem: {line}" for line in run.problems) for run in runs]
     return "## Runs\n\n" + "\n".join(lines)
 

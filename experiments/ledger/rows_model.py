@@ -178,7 +178,7 @@ def speed_row(*, batches: Sequence[int], seconds: float, device_name: str) -> Ro
         "precision, nor whether copying images counts."
     )
     if not batches:
-        return not_measured("throughput", claim, says, why="pass throughput=true to measure this device", how=how)
+        return not_measured("throughput", claim, says, why="left out by --no-throughput", how=how)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = HybridUNet().eval().to(device)
     speeds = [measure_speed(network, batch=batch, seconds=seconds, device=device) for batch in batches]

@@ -32,7 +32,7 @@ def accuracy_row(runs: Sequence[Run]) -> Row:
             if value is not None and (key not in best or value < best[key][0]):
                 best[key] = (value, run)
     if not best:
-        return not_measured("accuracy", claim, says, why="pass runs=[<a run tested on NYU>]", how=how)
+        return not_measured("accuracy", claim, says, why="pass --runs <a run tested on NYU>", how=how)
     said = []
     for source, split, protocol in _one_protocol_each(sorted(best)):
         if _is_nyu(source):
@@ -116,7 +116,7 @@ def split_effect_row(runs: Sequence[Run]) -> Row:
             else:
                 unclear.append(f"{said}): {'intervals not apart' if all(ends) else 'no intervals'}")
     if not cells:
-        why = "pass runs=[A,B]: one recipe trained with data.split=random and with data.split=scene or official"
+        why = "pass --runs A B: one recipe trained with data.split=random and with data.split=scene or official"
         return not_measured("random_against_scene", claim, says, why=why, how=how)
     return Row(
         "random_against_scene",
@@ -166,7 +166,7 @@ def units_of_runs_row(runs: Sequence[Run]) -> Row:
             )
             fits.append(round(ssim_misread, 3) >= tables.SSIM > round(ssim_right, 3))
     if not said:
-        why = "pass runs=[A,B]: one recipe on 8-bit depth, with data.encoding=uint8_10m and with paper_literal"
+        why = "pass --runs A B: one recipe on 8-bit depth, with data.encoding=uint8_10m and with paper_literal"
         return not_measured("units_of_runs", claim, says, why=why, how=how)
     paper = [
         "the paper",
@@ -209,7 +209,7 @@ def epochs_row(runs: Sequence[Run]) -> Row:
             )
     if not said:
         seen = f"; the longest passed has {longest}" if longest else ""
-        return not_measured("epochs", claim, says, why=f"pass runs=[<a run of {many} epochs>]{seen}", how=how)
+        return not_measured("epochs", claim, says, why=f"pass --runs <a run of {many} epochs>{seen}", how=how)
     return Row("epochs", claim, says, "; ".join(said), how, "measured", {"runs": values})
 
 
@@ -228,7 +228,7 @@ def edges_row(runs: Sequence[Run]) -> Row:
         if any(run.metric(protocol, name) is not None for name in EDGES)
     ]
     if not cells:
-        why = "run hudepth-test with a protocol that scores edges, on runs that differ in the loss; pass runs=[A,B]"
+        why = "run hudepth-test with a protocol that scores edges, on runs that differ in the loss; pass --runs A B"
         return not_measured("edges", claim, says, why=why, how=how)
     compared = [line for a, b in pairs(runs, "loss._target_", "loss") for line in _edges_of_pair(a, b)]
     verdicts = [verdict for _, verdict in compared]

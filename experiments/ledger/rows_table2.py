@@ -102,7 +102,7 @@ def protocol_row(runs: Sequence[Run]) -> Row:
             spans.append(
                 (known[high] / known[low] - 1, f"{run.name}: ARE {known[low]:.3f} ({low}), {known[high]:.3f} ({high})")
             )
-    said = max(spans)[1] if spans else "not measured: pass runs=[<a run tested under two protocols>]"
+    said = max(spans)[1] if spans else "not measured: pass --runs <a run tested under two protocols>"
     sources = len({row.source for row in tables.TABLE_2}) - 1
     header = ("run", "protocol", "what it scores", *NAMES)
     return Row(

@@ -115,7 +115,7 @@ def find_runs(paths: Sequence[str | Path]) -> list[Run]:
     for given in paths:
         path = Path(given).expanduser()
         if not path.is_dir():
-            raise ConfigError(f"runs: no folder '{path}'. Pass run directories, as runs=[experiments/badcl_official].")
+            raise ConfigError(f"runs: no folder '{path}'. Pass run directories, as --runs experiments/badcl_official.")
         found = (
             [path]
             if is_run(path)

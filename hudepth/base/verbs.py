@@ -11,7 +11,7 @@ COMMANDS = {
 """The package behind each console script; its ``command.py`` holds a function of the script's name."""
 
 
-VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "sweep", "figures", "paper")}
+VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "sweep", "figures")}
 """The first word after the console scripts that can do several things."""
 
 

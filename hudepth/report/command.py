@@ -1,4 +1,4 @@
-"""hudepth-report: what runs say, side by side and beside the paper."""
+"""hudepth-report: what runs say, side by side."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hudepth.base.verbs import VERBS
 
 
 def report(cfg: DictConfig) -> None:
-    """Run the verb ``compare``, ``table``, ``sweep``, ``figures`` or ``paper``.
+    """Run the verb ``compare``, ``table``, ``sweep`` or ``figures``.
 
     Args:
         cfg: what conf/report.yaml and the command line compose to.
@@ -40,10 +40,6 @@ def report(cfg: DictConfig) -> None:
         from hudepth.report.figures import figures
 
         figures(config)
-    elif verb == "paper":
-        from experiments.ledger.command import paper
-
-        paper(config)
     else:
         hint = did_you_mean(str(verb), VERBS["report"])
         raise ConfigError(f"verb: no '{verb}'.{hint} Use hudepth-report {' or '.join(VERBS['report'])}.")

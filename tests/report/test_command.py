@@ -44,9 +44,9 @@ def test_figures_without_the_checkpoint_are_the_curves(command: Command, trained
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "a verb is missing. Type hudepth-report followed by compare or table or sweep or figures or paper."),
+        ([], "a verb is missing. Type hudepth-report followed by compare or table or sweep or figures."),
         (["figure"], "no verb 'figure'. Did you mean 'figures'? Type hudepth-report followed by compare or table or"),
-        (["verb=x"], "verb: no 'x'. Use hudepth-report compare or table or sweep or figures or paper."),
+        (["verb=x"], "verb: no 'x'. Use hudepth-report compare or table or sweep or figures."),
         (["figures"], "checkpoint=last: no run with a checkpoint below 'runs'."),
         (
             ["figures", "run=nowhere"],

@@ -16,7 +16,7 @@ ROWS = [
     Row("b", "Second", "z", "3", "likewise", "cannot be"),
 ]
 TABLE_2 = Sheet("Table 2", ("method",), [["proposed"]])
-ENVIRONMENT = {"device": "a CPU", "packages": {"torch": "2.6"}, "command": ["hudepth-report", "paper"]}
+ENVIRONMENT = {"device": "a CPU", "packages": {"torch": "2.6"}, "command": ["python", "-m", "experiments.ledger"]}
 
 
 def test_every_verdict_has_a_colour() -> None:
@@ -31,7 +31,7 @@ def test_the_page_holds_every_row_and_table() -> None:
         "## 2. Second\n\n*The paper says:* z.\n\n*Measured:* 3.\n\n*How:* likewise\n\n*Verdict:* **cannot be**." in page
     )
     assert "**Small**\n\n| p | q |\n| --- | --- |\n| 1 | 2 |" in page
-    assert "computed by `hudepth-report paper`" in page
+    assert "computed by `python -m experiments.ledger`" in page
     assert "None were given" in page
     assert "- device: a CPU\n- packages: torch 2.6" in page
 

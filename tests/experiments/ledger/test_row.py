@@ -11,5 +11,5 @@ def test_a_row_takes_known_verdicts_only() -> None:
 
 
 def test_what_is_not_measured_says_why() -> None:
-    row = not_measured("key", "claim", "says", why="pass runs=[A]", how="so")
-    assert (row.measured, row.verdict) == ("not measured: pass runs=[A]", "not measured")
+    row = not_measured("key", "claim", "says", why="pass --runs A", how="so")
+    assert (row.measured, row.verdict) == ("not measured: pass --runs A", "not measured")

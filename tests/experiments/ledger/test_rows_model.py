@@ -52,7 +52,7 @@ def test_the_stated_figure_is_that_of_a_batch() -> None:
 
 def test_speed_can_be_left_out() -> None:
     row = rows_model.speed_row(batches=[], seconds=1, device_name="x")
-    assert (row.verdict, row.measured) == ("not measured", "not measured: pass throughput=true to measure this device")
+    assert (row.verdict, row.measured) == ("not measured", "not measured: left out by --no-throughput")
 
 
 @pytest.mark.parametrize(

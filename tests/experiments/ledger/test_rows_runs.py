@@ -15,7 +15,7 @@ MakeRun = Callable[..., Path]
 def test_without_runs_nothing_is_measured(row: Callable[..., object]) -> None:
     made = row([])
     assert made.verdict == "not measured"  # type: ignore[attr-defined]
-    assert "runs=[" in made.measured  # type: ignore[attr-defined]
+    assert "--runs" in made.measured  # type: ignore[attr-defined]
 
 
 def test_the_best_of_each_split_and_protocol_counts(make_run: MakeRun) -> None:
@@ -118,7 +118,7 @@ def test_epochs_are_compared_in_a_run_that_is_long_enough(make_run: MakeRun) -> 
     assert row.verdict == "measured"
     assert row.measured == "badcl (long): ARE 0.0333 by epoch 30, 0.0100 by 100 (-70.0%)"
     row = epochs_row([read_run(make_run("shorter", history=long[:99]))])
-    assert row.measured == "not measured: pass runs=[<a run of 100 epochs>]; the longest passed has 99"
+    assert row.measured == "not measured: pass --runs <a run of 100 epochs>; the longest passed has 99"
 
 
 @pytest.mark.parametrize(

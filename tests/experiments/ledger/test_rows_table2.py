@@ -57,7 +57,7 @@ def test_protocols_of_one_run_are_put_side_by_side(make_run: MakeRun) -> None:
 def test_one_protocol_is_not_enough(make_run: MakeRun) -> None:
     run = read_run(make_run("one", tests={"eigen": {"abs_rel": 0.2}}))
     assert protocol_row([run]).verdict == "not measured"
-    assert protocol_row([]).measured == "not measured: pass runs=[<a run tested under two protocols>]"
+    assert protocol_row([]).measured == "not measured: pass --runs <a run tested under two protocols>"
 
 
 def test_table_2_gains_a_row_for_each_test(make_run: MakeRun) -> None:

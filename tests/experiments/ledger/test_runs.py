@@ -42,7 +42,7 @@ def test_folders_without_a_run_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
         find_runs([tmp_path / "none"])
     assert str(error.value) == (
-        f"runs: no folder '{tmp_path}/none'. Pass run directories, as runs=[experiments/badcl_official]."
+        f"runs: no folder '{tmp_path}/none'. Pass run directories, as --runs experiments/badcl_official."
     )
     with pytest.raises(ConfigError) as error:
         find_runs([tmp_path])

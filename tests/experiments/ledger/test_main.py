@@ -3,25 +3,23 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from experiments.ledger import command as task
+from experiments.ledger import __main__ as ledger_main
 from hudepth.base.errors import ConfigError
 
-STUDY = Path(__file__).parents[2] / "experiments" / "badcl_official"
-QUICK: dict[str, Any] = {"runs": [], "throughput": False, "batches": [1], "seconds": 0}
+STUDY = Path(__file__).parents[3] / "experiments" / "badcl_official"
 
 
 @pytest.fixture(autouse=True)
 def few_small_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(task, "ROOMS", 3)
-    monkeypatch.setattr(task, "ROOM_SIDE_PX", 48)
+    monkeypatch.setattr(ledger_main, "ROOMS", 3)
+    monkeypatch.setattr(ledger_main, "ROOM_SIDE_PX", 48)
 
 
 def test_a_fresh_checkout_gives_the_whole_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    task.paper({**QUICK, "output": str(tmp_path / "led")})
+    ledger_main.main(["--no-throughput", "--output", str(tmp_path / "led")])
     ledger = json.loads((tmp_path / "led" / "ledger.json").read_text())
     verdicts = {row["key"]: row["verdict"] for row in ledger["rows"]}
     assert verdicts == {
@@ -55,11 +53,12 @@ def test_a_fresh_checkout_gives_the_whole_ledger(tmp_path: Path, capsys: pytest.
     assert max(map(len, out.splitlines()[:-1])) <= 120
 
 
+@pytest.mark.slow
 def test_a_study_serves_as_evidence_and_damage_spoils_its_own_rows_only(tmp_path: Path) -> None:
     study = tmp_path / "study"
     shutil.copytree(STUDY, study)
     (study / "test" / "eigen" / "metrics.json").write_text("{")
-    task.paper({**QUICK, "runs": [str(study)], "output": str(tmp_path)})
+    ledger_main.main(["--no-throughput", "--runs", str(study), "--output", str(tmp_path)])
     ledger = json.loads((tmp_path / "ledger.json").read_text())
     rows = {row["key"]: row for row in ledger["rows"]}
     assert rows["accuracy"]["verdict"] == "not reached"
@@ -71,6 +70,7 @@ def test_a_study_serves_as_evidence_and_damage_spoils_its_own_rows_only(tmp_path
     assert ledger["table_2"]["cells"][-1][0] == "badcl_official (study)"
 
 
+@pytest.mark.slow
 def test_speed_is_measured_when_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from experiments.ledger import rows_model
     from experiments.ledger.speed import Speed
@@ -82,27 +82,18 @@ def test_speed_is_measured_when_asked(tmp_path: Path, monkeypatch: pytest.Monkey
         return Speed(batch, 10.0, 1)
 
     monkeypatch.setattr(rows_model, "measure_speed", measured)
-    task.paper({**QUICK, "throughput": True, "batches": [2, 3], "seconds": 0.5, "output": str(tmp_path)})
+    ledger_main.main(["--batches", "2", "3", "--seconds", "0.5", "--output", str(tmp_path)])
     assert asked == [(2, 0.5), (3, 0.5)]
 
 
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ({"batches": [1, 0]}, "batches: [1, 0] is no list of positive whole numbers. Pass batches=[1,4,8,16,32]."),
-        ({"batches": 4}, "batches: 4 is no list of positive whole numbers. Pass batches=[1,4,8,16,32]."),
-        ({"seconds": -1}, "seconds: -1 is no time. Pass the seconds for each batch size, as seconds=3."),
-        ({"seconds": "long"}, "seconds: long is no time. Pass the seconds for each batch size, as seconds=3."),
-    ],
-)
-def test_bad_options_are_found_before_any_work(tmp_path: Path, option: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        task.paper({**QUICK, "output": str(tmp_path / "led"), **option})
-    assert str(error.value) == message
+@pytest.mark.parametrize(("option", "value"), [("--batches", "0"), ("--seconds", "-1"), ("--runs", "nowhere")])
+def test_bad_options_are_found_before_any_work(tmp_path: Path, option: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{option.strip('-')}|^{option}"):
+        ledger_main.main([option, value, "--output", str(tmp_path / "led")])
     assert not (tmp_path / "led").exists()
 
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"output: cannot make '.*/file' \(.+\)\. Pass output=<a folder"):
-        task.paper({**QUICK, "output": str(tmp_path / "file")})
+    with pytest.raises(ConfigError, match=r"^--output: cannot write to '.*/file'"):
+        ledger_main.main(["--output", str(tmp_path / "file")])

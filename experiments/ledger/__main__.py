@@ -1,11 +1,16 @@
-"""hudepth-report paper: what the paper claims beside what is measured here and now."""
+"""What the paper claims, next to what is measured here and now: writes ledger.md and ledger.json, prints the table.
+
+python -m experiments.ledger [--runs experiments/badcl_official ...] [--output FOLDER] [--no-throughput]
+"""
 
 from __future__ import annotations
 
+import argparse
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -15,53 +20,52 @@ from experiments.ledger.row import Row
 from experiments.ledger.runs import Run, find_runs
 from experiments.ledger.units import predictions, render_rooms, score_readings
 from hudepth.base.console import log, track
-from hudepth.base.errors import ConfigError
+from hudepth.base.errors import HudepthError
 from hudepth.base.files import write_json, write_text
+from hudepth.base.options import Range, convert, output_folder
 from hudepth.runs.run_dir import environment
 
-DEFAULT_OUTPUT = "paper_ledger"
 ROOMS, ROOM_SIDE_PX = 24, 112
 """Built-in rooms that the rows on units are measured on."""
 
 
-def paper(config: dict[str, Any]) -> None:
-    """Measure every claim, write ledger.md and ledger.json, print the table.
-
-    Args:
-        config: ``runs`` (run directories or studies, may be empty), ``output`` (folder; default ``./paper_ledger``),
-            ``throughput`` (whether to measure speed), ``batches`` (sizes at which), ``seconds`` (for each).
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Check every claim of the paper.
 
     Raises:
-        ConfigError: for values out of range, folders that hold no run, or an output folder that cannot be made.
+        ConfigError: for values out of range, folders without a run, or an output folder that cannot be written.
     """
-    batches, seconds = _speed_options(config)
-    output = Path(config.get("output") or DEFAULT_OUTPUT).expanduser()
-    runs = find_runs(config.get("runs") or [])
-    _make_folder(output)
+    options = _parser().parse_args(arguments)
+    batches = convert("--batches", options.batches, list[Annotated[int, Range(1)]])
+    seconds = convert("--seconds", options.seconds, Annotated[float, Range(0)])
+    runs = find_runs(options.runs)
+    output = output_folder(options.output, key="--output")
     for line in (line for run in runs for line in run.problems):
         log.warning("%s", line)
-    here = environment(seed=0, accelerator="auto")
-    makers = _makers(runs, batches=batches, seconds=seconds, device_name=str(here["device"]))
+    words = sys.argv[1:] if arguments is None else arguments
+    here = {**environment(seed=0, accelerator="auto"), "command": ["python", "-m", "experiments.ledger", *words]}
+    makers = _makers(runs, batches=batches if options.throughput else [], seconds=seconds, device=str(here["device"]))
     rows = [row for make in track(makers, total=len(makers), what="checking the paper") for row in make()]
     parts: dict[str, Any] = {"table_2": rows_table2.table_2_with_runs(runs), "runs": runs, "environment": here}
     write_json(output / "ledger.json", plain_ledger(rows, **parts))
     write_text(output / "ledger.md", markdown(rows, **parts))
     stdout = Console()
     (stdout if stdout.is_terminal else Console(width=120)).print(terminal_table(rows))
-    print(f"{output / 'ledger.md'} has each row in full, {output / 'ledger.json'} the figures.")
+    print(f"{output / 'ledger.md'} has every row in full, {output / 'ledger.json'} the figures.")
 
 
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"output: cannot make '{path}' ({error.strerror}). Pass output=<a folder you can write to>."
-        ) from error
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("python -m experiments.ledger", description="Check every claim of the paper.")
+    parser.add_argument("--runs", nargs="+", default=[], metavar="DIR", help="run directories or study folders")
+    parser.add_argument("--output", type=Path, default=Path("ledger"), help="folder to write to")
+    parser.add_argument("--no-throughput", dest="throughput", action="store_false", help="do not measure speed")
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 8, 16, 32], help="of the speed row")
+    parser.add_argument("--seconds", type=float, default=3, help="of timed passes at each batch size")
+    return parser
 
 
 def _makers(
-    runs: Sequence[Run], *, batches: Sequence[int], seconds: float, device_name: str
+    runs: Sequence[Run], *, batches: Sequence[int], seconds: float, device: str
 ) -> list[Callable[[], list[Row]]]:
     """Return what makes the rows, in the ledger's order."""
     before: list[Callable[[], Row]] = [
@@ -70,7 +74,7 @@ def _makers(
         rows_model.text_row,
         rows_model.cost_row,
         rows_model.torchinfo_row,
-        partial(rows_model.speed_row, batches=batches, seconds=seconds, device_name=device_name),
+        partial(rows_model.speed_row, batches=batches, seconds=seconds, device_name=device),
         rows_model.table_3_row,
         rows_data.split_row,
         rows_data.leakage_row,
@@ -104,10 +108,8 @@ def _rows_on_rooms() -> list[Row]:
     ]
 
 
-def _speed_options(config: dict[str, Any]) -> tuple[list[int], float]:
-    batches, seconds = config.get("batches") or [], config.get("seconds", 3)
-    if not isinstance(batches, list) or not all(type(batch) is int and batch > 0 for batch in batches):
-        raise ConfigError(f"batches: {batches} is no list of positive whole numbers. Pass batches=[1,4,8,16,32].")
-    if not isinstance(seconds, (int, float)) or not 0 <= seconds < float("inf"):
-        raise ConfigError(f"seconds: {seconds} is no time. Pass the seconds for each batch size, as seconds=3.")
-    return (batches if config.get("throughput", True) else []), float(seconds)
+if __name__ == "__main__":
+    try:
+        main()
+    except HudepthError as error:
+        sys.exit(f"ledger: {error}")
