@@ -15,8 +15,9 @@ from hudepth.data.datamodule import DepthDataModule, preprocess
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.evaluation.baselines import ConstantDepth, trivial_baselines
+from hudepth.evaluation.grids import SUM_COLUMNS
 from hudepth.evaluation.routine import Evaluation
-from hudepth.evaluation.scoring import SUM_COLUMNS, image_table
+from hudepth.evaluation.scoring import image_table
 from hudepth.metrics.boundary import BOUNDARY_NAMES, boundary_metrics
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.strata import STRATA

@@ -16,7 +16,8 @@ from torch.nn import functional
 from hudepth.base.errors import ConfigError
 from hudepth.base.types import Batch
 from hudepth.data.sources.base import Record
-from hudepth.evaluation.scoring import SUM_COLUMNS, BatchScores, BatchTruth, image_table
+from hudepth.evaluation.grids import SUM_COLUMNS
+from hudepth.evaluation.scoring import BatchScores, BatchTruth, image_table
 from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.summary import ImageTable, summarise
