@@ -12,18 +12,17 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError, HudepthError
 from hudepth.runs.history import read_history
+from hudepth.runs.identity import INCIDENTAL
 from hudepth.runs.results import MODEL, flat
 from hudepth.runs.run_dir import is_run, read_config
 
 """What metrics.json calls the trained network, beside the baselines."""
-INCIDENTAL = (
-    "name", "monitor", "mode", "test", "resume", "trust", "callbacks", "logger", "protocol", "paths", "hydra", "debug",
-    "data.root", "data.cache", "data.num_workers", "data.native", "data.on_error", "data.prepare_workers",
-    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy", "trainer.deterministic",
+NOT_RECIPE = (
+    *INCIDENTAL, "monitor", "mode", "callbacks", "data.native", "data.on_error", "trainer.deterministic",
     "trainer.max_epochs", "model.weights",
 )  # fmt: skip
-"""Keys in which two runs of one recipe may differ: places, hardware, and how long it ran. Of ``model.weights`` it only
-counts whether there are any."""
+"""Keys in which two runs of one recipe may differ: places, hardware, and how long it ran. Of ``model.weights`` only
+matters whether there are any."""
 
 
 @dataclass(frozen=True)
@@ -174,9 +173,9 @@ def read_result(file: Path) -> dict[str, Any]:
 def same_but(a: Run, b: Run, *keys: str) -> bool:
     """Tell whether two runs follow one recipe except in ``keys`` and what lies below them.
 
-    Keys in :data:`INCIDENTAL` may differ too. Runs whose configuration is unknown match nothing.
+    Keys in :data:`NOT_RECIPE` may differ too. Runs whose configuration is unknown match nothing.
     """
-    ignored = (*INCIDENTAL, *keys)
+    ignored = (*NOT_RECIPE, *keys)
 
     def recipe(run: Run) -> dict[str, Any]:
         kept = {k: v for k, v in run.config.items() if not any(k == i or k.startswith(f"{i}.") for i in ignored)}

@@ -11,8 +11,6 @@ Nothing here knows of Hydra: ``hudepth.sweep.sweeper`` makes sweeps, ``hudepth-r
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,43 +22,12 @@ import yaml
 from hudepth.base.errors import DataError, HudepthError, did_you_mean
 from hudepth.base.files import read_yaml, write_text
 from hudepth.runs import run_dir
-from hudepth.runs.results import flat
+from hudepth.runs.identity import run_key
 
 SWEEP_FILE = "sweep.yaml"
-INCIDENTAL = (
-    "name", "resume", "trust", "test", "baselines", "protocol", "sweep_dir", "variant", "paths", "logger",
-    "hydra", "debug",
-    "callbacks.panels", "callbacks.panels_every_n_epochs",
-    "data.root", "data.cache", "data.num_workers", "data.prepare_workers",
-    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy",
-)  # fmt: skip
-"""Keys that do not tell one training from another: names, places, hardware, pictures, and how it is tested."""
 SEEDS = ("seed", "data.seed")
 """Keys in which repetitions of one configuration differ. ``data.split_seed`` is not one: it makes another test set."""
 FINISHED, FAILED, PRUNED, INTERRUPTED, RUNNING = "finished", "failed", "pruned", "interrupted", "running"
-
-
-def identity(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what makes a training what it is: its configuration by dotted key, without :data:`INCIDENTAL` keys."""
-    values = flat(config)
-    return {key: values[key] for key in sorted(values) if not _is_incidental(key)}
-
-
-def _is_incidental(key: str) -> bool:
-    return any(key == name or key.startswith(f"{name}.") for name in INCIDENTAL)
-
-
-def run_key(config: Mapping[str, Any]) -> str:
-    """Return 10 hexadecimal digits by which a configuration is known; those of equal :func:`identity` are equal."""
-    text = json.dumps({key: _same(value) for key, value in identity(config).items()}, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:10]
-
-
-def _same(value: Any) -> Any:
-    """Let 1 and 1.0 be the same number, also within lists."""
-    if isinstance(value, list | tuple):
-        return [_same(item) for item in value]
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def folder_name(labels: Mapping[str, str], key: str) -> str:
@@ -87,7 +54,7 @@ class SweepRun:
 
     @property
     def key(self) -> str:
-        """See :func:`run_key`."""
+        """See :func:`hudepth.runs.identity.run_key`."""
         return run_key(self.config)
 
 

@@ -12,8 +12,9 @@ from hydra.core.override_parser.types import Override
 
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.runs import run_dir
+from hudepth.runs.identity import INCIDENTAL, run_key
 from hudepth.runs.results import flat
-from hudepth.runs.sweeps import FINISHED, INCIDENTAL, folder_name, run_key
+from hudepth.runs.sweeps import FINISHED, folder_name
 
 VARIANT = "variant"
 SEED = "seed"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,7 @@ from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import plain
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import read_plain
-
-CHANGEABLE = (
-    "trainer.", "callbacks.", "logger.", "data.root", "data.num_workers", "data.prepare_workers", "distill.teacher",
-    "paths.", "test", "trust",
-)  # fmt: skip
-"""What may differ when a run goes on. All else is in its checkpoint or its split and would only seem to change."""
+from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
 
 PARTS = (
     "seed",
@@ -65,27 +59,16 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
         if key == "resume":
             continue
         found = OmegaConf.select(resumed, key, default=resumed)
-        if not key.startswith(CHANGEABLE) or OmegaConf.is_dict(found) or (found is resumed and key.count(".") != 1):
+        if not is_below(key, RESUMABLE) or OmegaConf.is_dict(found) or (found is resumed and key.count(".") != 1):
             raise ConfigError(
                 f"resume: '{override}' cannot be changed when a run is continued; trainer.max_epochs and other "
                 "values of trainer, callbacks and logger can. Start a new run for anything else."
             )
         OmegaConf.update(resumed, key, OmegaConf.from_dotlist([f"value={value}"])["value"], force_add=True)
     result = plain(resumed)
-    if result["trainer"].get("max_epochs") != epochs and (why := _bound_to_length(config)):
+    if result["trainer"].get("max_epochs") != epochs and (why := part_bound_to_length(config)):
         raise ConfigError(
             f"resume: {why} of this run is laid out over {epochs} epochs, so trainer.max_epochs cannot change. "
             "Start a new run, or use schedule=constant and data.progressive=null from the start."
         )
     return result
-
-
-def _bound_to_length(config: Mapping[str, Any]) -> str:
-    """Name the part of a run's configuration that depends on how long it trains, if there is one."""
-    schedule = config["schedule"] or {}
-    if "T_max" in schedule or str(schedule.get("_target_")).startswith("hudepth.training.schedules."):
-        return "the learning-rate schedule"
-    if config["data"].get("progressive"):
-        return "the progressive resolution"
-    freezes = [extra for extra in config["callbacks"].get("extra") or [] if "FreezeTrunk" in str(extra.get("_target_"))]
-    return "FreezeTrunk" if freezes else ""

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hudepth.runs.sweeps import SEEDS, identity
+from hudepth.runs.identity import identity
+from hudepth.runs.sweeps import SEEDS
 
 TARGET = "_target_"
 ABSENT = "-"
