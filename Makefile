@@ -3,10 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help install demo ledger test lint format clean
+.PHONY: help install demo test test-all lint ledger format clean
 
 help:  ## show this list
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 install: $(INSTALLED)  ## make .venv and install hudepth with its development tools
 
@@ -20,16 +20,19 @@ $(INSTALLED): pyproject.toml constraints.txt
 demo: $(INSTALLED)  ## train and test a first model on built-in rooms, in under 3 minutes
 	$(BIN)/hudepth-train +experiment=demo
 
-ledger: $(INSTALLED)  ## check every claim of the paper; ARGS="--runs DIR ..." adds runs as evidence
-	$(BIN)/python -m experiments.ledger $(ARGS)
+test: $(INSTALLED)  ## run the fast tests, in a few minutes
+	$(BIN)/python -m pytest -n auto --dist worksteal --durations 25 -m "not slow"
 
-test: $(INSTALLED)  ## run all tests
-	$(BIN)/python -m pytest -n auto --dist loadfile
+test-all: $(INSTALLED)  ## run all tests, as continuous integration does
+	$(BIN)/python -m pytest -n auto --dist worksteal --durations 25
 
 lint: $(INSTALLED)  ## ruff and mypy --strict
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+ledger: $(INSTALLED)  ## check every claim of the paper; ARGS="--runs DIR ..." adds runs as evidence
+	$(BIN)/python -m experiments.ledger $(ARGS)
 
 format: $(INSTALLED)  ## format the code
 	$(BIN)/ruff check --fix --exit-zero .

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ast
 import os
 import re
 import subprocess
@@ -90,23 +89,6 @@ def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version
         if requirement.startswith("hudepth["):
             continue
         assert f"\n{re.split('[><=]', requirement)[0].lower()}==" in tested.lower(), requirement
-
-
-def imported(path: Path) -> set[str]:
-    """Return the top-level packages a file imports when it is imported."""
-    names = set()
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            names.add((node.module or "").partition(".")[0])
-    return names
-
-
-def test_hydra_stops_at_the_tasks() -> None:
-    for path in (ROOT / "hudepth").rglob("*.py"):
-        if path.parent.name != "tasks":
-            assert not imported(path) & {"hydra", "omegaconf"}, path
 
 
 def test_what_worker_processes_import_is_light(tmp_path: Path) -> None:

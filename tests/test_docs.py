@@ -1,4 +1,4 @@
-"""Every block of the README is executed; figures in it must be those of the committed run."""
+"""Every block of the README and of docs/ is executed; their figures must be those of the committed runs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import runpy
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,14 +16,21 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 
 from hudepth import cli
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.DOTALL)
-COMMANDS = [line for language, block in BLOCKS if language == "bash" for line in block.strip().splitlines()]
+PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
+README = PAGES[ROOT / "README.md"]
+TEXT = "\n".join(PAGES.values())
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.DOTALL)
+COMMANDS = list(
+    dict.fromkeys(line for language, block in BLOCKS if language == "bash" for line in block.strip().splitlines())
+)
+ORDER = ("train", "test", "export", "predict", "data", "report", "bench", "demo")
+"""Of the commands, so that each finds what it needs."""
 
 SMALL = [
     "data.size=[32,48]", "trainer.max_epochs=1", "trainer.accelerator=cpu", "data.batch_size=2", "callbacks.panels=0",
@@ -62,7 +70,7 @@ def shortened(command: str) -> list[str]:
     words = command.split()
     if words[0] == "hudepth-bench":
         return [*words, "backends=[default]", "batches=[1]", "repeats=1", "seconds=0"]
-    if words[0] == "hudepth-export":  # tests/tasks/test_export.py makes all formats
+    if words[0] == "hudepth-export":  # tests/export/test_command.py makes all formats
         return [word.replace("onnx,torch_export,openvino,int8", "onnx") for word in words]
     if words[0] != "hudepth-train" or {"--help", "--cfg"} & set(words) or "resume=" in command:
         return words
@@ -82,12 +90,31 @@ def check_demo(words: list[str], folder: Path) -> None:
     assert page.returncode in (0, 130)
 
 
-def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("command", [each for each in COMMANDS if each.startswith("hudepth-")])
+def test_every_command_composes(command: str) -> None:
+    script, *words = shlex.split(command)
+    task = script.removeprefix("hudepth-")
+    if not {"--help", "--cfg", "-m"} & set(words) and "resume=" not in command:
+        GlobalHydra.instance().clear()
+        with initialize_config_module("hudepth.conf", version_base="1.3"):
+            assert compose(task, overrides=cli.rewrite(task, [word for word in words if "variant=" not in word]))
+
+
+def place(command: str) -> float:
+    """Return when to run a command; what resumes a run comes after the trainings."""
+    return next((i for i, task in enumerate(ORDER) if f"hudepth-{task}" in command), 9) + 0.5 * ("resume=" in command)
+
+
+@pytest.mark.slow
+def test_every_command_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("HUDEPTH_CACHE", str(folder / "cache"))
-    for command in COMMANDS:
+    ordered = sorted(
+        COMMANDS, key=lambda each: next((i for i, task in enumerate(ORDER) if f"hudepth-{task}" in each), 9)
+    )
+    for command in sorted(ordered, key=lambda each: "resume=" in each and 0.5):
         words = shortened(command)
-        if words[0] == "source":
+        if not words or words[0] == "source":
             continue  # the tests run inside the environment
         if words[0] == "make":
             subprocess.run(["make", "--dry-run", "--directory", str(ROOT), *words[1:]], check=True, capture_output=True)
@@ -111,11 +138,12 @@ def test_every_command_of_the_readme(folder: Path, monkeypatch: pytest.MonkeyPat
     assert all(json.loads(job.read_text())["state"] == "finished" for job in jobs)
 
 
-def test_the_python_of_the_readme(folder: Path) -> None:
+@pytest.mark.slow
+def test_the_python_of_the_pages(folder: Path) -> None:
     code = "\n".join(block for language, block in BLOCKS if language == "python")
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, text=True, capture_output=True, check=True)
-    predicted, trained = done.stdout.splitlines()
-    assert re.fullmatch(r"\(40, 50\) [\d.]+", predicted)
+    *predicted, trained = done.stdout.splitlines()
+    assert all(re.fullmatch(r"\(40, 50\) [\d.]+", line) for line in predicted)
     assert (folder / "points.ply").stat().st_size > 40 * 50 * 15
     assert re.fullmatch(r"\{'boundary': [\d.]+, 'smoothness': [\d.]+, 'scaling': [\d.]+\}", trained)
 
@@ -125,12 +153,15 @@ def test_all_blocks_are_of_a_kind_that_is_tested() -> None:
 
 
 def test_links_lead_somewhere() -> None:
-    headings = [line[3:].lower().replace(" ", "-") for line in README.splitlines() if line.startswith("## ")]
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        if target.startswith("#"):
-            assert target[1:] in headings, target
-        else:
-            assert target.startswith("https://") or (ROOT / target).exists(), target
+    for page, text in PAGES.items():
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
+            assert target.startswith("https://") or (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_the_readme_fits_into_a_minute() -> None:
+    assert README.count("\n") <= 150
+    for page in (ROOT / "docs").glob("*.md"):
+        assert f"(docs/{page.name})" in README
 
 
 def test_the_results_are_those_of_the_run() -> None:
@@ -148,7 +179,7 @@ def test_the_speeds_are_those_of_the_benchmark() -> None:
     table = runpy.run_path(str(speed / "inference_table.py"))["table"]
     with (speed / "inference" / "bench.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert README.split("<!-- speed -->\n")[1].strip() == table(rows)
+    assert TEXT.split("<!-- speed -->\n")[1].strip() == table(rows)
 
 
 def test_what_a_random_split_is_worth_is_what_the_study_found() -> None:
@@ -161,14 +192,14 @@ def test_what_a_random_split_is_worth_is_what_the_study_found() -> None:
 
 @pytest.mark.parametrize("group", ["data", "protocol", "+sweep"])
 def test_a_table_lists_every_choice(group: str) -> None:
-    (table,) = re.findall(rf"^\| `{re.escape(group)}=` \|.*\n\|---\|---\|\n((?:\|.*\n)+)", README, re.MULTILINE)
+    (table,) = re.findall(rf"^\| `{re.escape(group)}=` \|.*\n\|---\|---\|\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     listed = set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
     assert listed == {path.stem for path in (ROOT / "conf" / group.lstrip("+")).glob("*.yaml")} - {"base"}
 
 
 def test_make_help_lists_every_target() -> None:
     done = subprocess.run(["make", "help"], cwd=ROOT, text=True, capture_output=True, check=True)
-    for target in ("help", "install", "demo", "test", "lint", "format", "clean"):
+    for target in ("help", "install", "demo", "test", "test-all", "lint", "ledger", "format", "clean"):
         assert re.search(rf"^{target}\s+\w", done.stdout, re.MULTILINE)
 
 
