@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import absl.logging
 import jaxtyping
 import pytest
 import torch
+from filelock import FileLock
 from hypothesis import settings
 
 from tests.commands import TINY, Command, Result, script
@@ -44,9 +46,18 @@ def _own_logging(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all test processes share: what is expensive is made there once."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def cache(shared: Path) -> Path:
     """One folder of depth stores for all tests, so that rooms are rendered once."""
-    return tmp_path_factory.mktemp("cache")
+    folder = shared / "cache"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture
@@ -71,10 +82,15 @@ def command(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capfd:
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
-    """A run directory of a finished two-epoch run, made by the installed script from a folder of its own."""
-    folder = tmp_path_factory.mktemp("trained")
-    done = subprocess.run(**script("train", *TINY, "name=tiny", cwd=folder, cache=cache), check=False)
-    assert done.returncode == 0, done.stdout
-    (run,) = (folder / "runs" / "tiny").iterdir()
+def trained(shared: Path, tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    """The run directory of a two-epoch run, made once by the installed script; each process has a copy of its own."""
+    with FileLock(shared / "trained.lock"):
+        if not (shared / "trained").is_dir():
+            folder = tmp_path_factory.mktemp("trained")
+            done = subprocess.run(**script("train", *TINY, "name=tiny", cwd=folder, cache=cache), check=False)
+            assert done.returncode == 0, done.stdout
+            folder.rename(shared / "trained")
+    copy = tmp_path_factory.mktemp("copy")
+    shutil.copytree(shared / "trained" / "runs", copy / "runs")
+    (run,) = (copy / "runs" / "tiny").iterdir()
     return run
