@@ -1,9 +1,9 @@
-"""Procedural textures for the built-in rooms, fixed to the faces they lie on."""
+"""Procedural textures fixed to the faces of solids, and the colours of a room."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from hudepth.data.rooms.raycast import F32
 
-Colour: TypeAlias = tuple[float, float, float]
+Colour: TypeAlias = tuple[float, ...]
+"""Linear RGB."""
 
 _TABLE = 512
 
@@ -39,15 +40,14 @@ def _noise_table() -> F32:
 
 
 def noise(u: F32, v: F32) -> F32:
-    """Look fractal noise up; it repeats every 512 units."""
-    i = u.astype(np.int32) & (_TABLE - 1)
-    j = v.astype(np.int32) & (_TABLE - 1)
-    values: F32 = _noise_table().ravel()[j * _TABLE + i]
+    """Look up fractal noise [0, 1] at any points; it repeats every 512 units."""
+    column, row = u.astype(np.int32) & (_TABLE - 1), v.astype(np.int32) & (_TABLE - 1)
+    values: F32 = _noise_table()[row, column]
     return values
 
 
 def _fibres(u: F32, v: F32) -> F32:
-    """As :func:`noise`, interpolated along v: without it the long cells of wood grain show their ends."""
+    """As :func:`noise`, interpolated along v: otherwise the ends of long cells would show in wood grain."""
     row = np.floor(v)
     start, part = noise(u, row), v - row
     return start + (noise(u, row + 1) - start) * part
@@ -83,7 +83,6 @@ def _stripes(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
 
 
 def _books(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
-    del sharp
     book = np.floor(u / scale + 0.6 * np.sin(u / scale)).astype(np.int32)
     colour: F32 = np.stack([_hash(book * 3 + c) for c in (0, 1, 2)])
     weight: F32 = (0.6 * colour + 0.4 * _hash(book * 5 + 1)) ** 2 * (0.8 + 0.4 * noise(u * 40, v * 300))
@@ -92,87 +91,75 @@ def _books(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
 
 def _view(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     """Large soft shapes, brighter above: a painting, or what a screen shows."""
-    del sharp
     shapes: F32 = np.clip(3 * noise(u * 90 + 40, v * 90 + 90) - 1 + 0.8 * v / scale, 0, 1)
     return shapes
 
 
-def _mottled(*, cells_per_m: float, strength: float) -> Pattern:
-    def pattern(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
-        del sharp
-        return 0.5 + strength * (noise(u * cells_per_m / scale, v * cells_per_m / scale) - 0.5)
-
-    return pattern
+def _mottled(cells_per_m: float, strength: float, u: F32, v: F32, scale: F32, sharp: F32) -> F32:
+    return 0.5 + strength * (noise(u * cells_per_m / scale, v * cells_per_m / scale) - 0.5)
 
 
-Pattern: TypeAlias = Callable[[F32, F32, F32, F32], F32]
-PATTERNS: dict[str, Pattern] = {
-    "plain": _mottled(cells_per_m=35, strength=0.8),
-    "glow": _mottled(cells_per_m=35, strength=0.8),
-    "fabric": _mottled(cells_per_m=420, strength=1.4),
-    "blotches": _mottled(cells_per_m=60, strength=1.6),
+PATTERNS: dict[str, Callable[[F32, F32, F32, F32], F32]] = {
+    "plain": partial(_mottled, 35, 0.8),
+    "glow": partial(_mottled, 35, 0.8),
+    "fabric": partial(_mottled, 420, 1.4),
+    "blotches": partial(_mottled, 60, 1.6),
     "wood": _wood,
     "tiles": _tiles,
     "stripes": _stripes,
     "books": _books,
     "view": _view,
 }
-"""How to compute each pattern of :class:`Material`; arguments as in :func:`pattern_weight`."""
+"""How to compute each pattern of :class:`Material` from u, v, scale, and the sharpness of seams."""
 
 
-def pattern_weight(pattern: str, u: F32, v: F32, scale: F32, footprint: F32) -> F32:
-    """Return how much of the second colour each point gets: [n], or [3, n] where every channel has its own.
+def pattern_weight(material: Material, u: F32, v: F32, footprint: F32) -> F32:
+    """Return how much of the second colour each point gets: [n], or [3, n] if every channel has its own.
 
     Args:
-        pattern: see :class:`Material`.
+        material: its pattern and scale are used.
         u: [n] metres along the face.
-        v: [n] metres along the face, upwards where the face stands.
-        scale: [n] metres.
+        v: [n] metres along the face, upwards on vertical faces.
         footprint: [n] size of a pixel on the face [m]; seams and stripes finer than that fade out.
     """
-    sharp = np.clip(scale / (4 * footprint + 1e-6), 0, 1)
-    return PATTERNS[pattern](u, v, scale, sharp)
+    scale = np.array(material.scale_m, np.float32)
+    return PATTERNS[material.pattern](u, v, scale, np.clip(scale / (4 * footprint + 1e-6), 0, 1))
 
 
+# fmt: off
 _WALLS: tuple[Colour, ...] = (
-    (0.72, 0.68, 0.58),
-    (0.75, 0.74, 0.70),
-    (0.62, 0.66, 0.62),
-    (0.66, 0.58, 0.44),
-    (0.55, 0.62, 0.70),
-    (0.70, 0.60, 0.52),
+    (0.72, 0.68, 0.58), (0.75, 0.74, 0.70), (0.62, 0.66, 0.62),
+    (0.66, 0.58, 0.44), (0.55, 0.62, 0.70), (0.70, 0.60, 0.52),
 )
 _WOODS: tuple[Colour, ...] = (
-    (0.42, 0.24, 0.11),
-    (0.20, 0.10, 0.05),
-    (0.55, 0.38, 0.20),
-    (0.30, 0.13, 0.06),
-    (0.60, 0.48, 0.32),
-    (0.62, 0.60, 0.56),
+    (0.42, 0.24, 0.11), (0.20, 0.10, 0.05), (0.55, 0.38, 0.20),
+    (0.30, 0.13, 0.06), (0.60, 0.48, 0.32), (0.62, 0.60, 0.56),
 )
 _FABRICS: tuple[Colour, ...] = (
-    (0.10, 0.14, 0.26),
-    (0.34, 0.08, 0.07),
-    (0.30, 0.27, 0.22),
-    (0.09, 0.16, 0.10),
-    (0.46, 0.40, 0.30),
-    (0.07, 0.07, 0.08),
-    (0.20, 0.10, 0.05),
+    (0.10, 0.14, 0.26), (0.34, 0.08, 0.07), (0.30, 0.27, 0.22), (0.09, 0.16, 0.10),
+    (0.46, 0.40, 0.30), (0.07, 0.07, 0.08), (0.20, 0.10, 0.05),
 )
 _ACCENTS: tuple[Colour, ...] = (
-    (0.55, 0.07, 0.05),
-    (0.06, 0.16, 0.42),
-    (0.62, 0.45, 0.06),
-    (0.08, 0.30, 0.12),
-    (0.65, 0.60, 0.50),
-    (0.35, 0.10, 0.28),
-    (0.05, 0.35, 0.38),
-    (0.60, 0.25, 0.06),
+    (0.55, 0.07, 0.05), (0.06, 0.16, 0.42), (0.62, 0.45, 0.06), (0.08, 0.30, 0.12),
+    (0.65, 0.60, 0.50), (0.35, 0.10, 0.28), (0.05, 0.35, 0.38), (0.60, 0.25, 0.06),
 )
-
-
-def _dim(colour: Colour, factor: float) -> Colour:
-    return (colour[0] * factor, colour[1] * factor, colour[2] * factor)
+# fmt: on
+_SAME_EVERYWHERE = {
+    "ceiling": Material("plain", (0.80, 0.79, 0.76), (0.74, 0.73, 0.70)),
+    "books": Material("books", (0.05, 0.04, 0.04), (0.75, 0.65, 0.55), 0.035),
+    "tiles": Material("tiles", (0.68, 0.68, 0.64), (0.40, 0.40, 0.38), 0.15),
+    "white": Material("plain", (0.78, 0.77, 0.74), (0.66, 0.65, 0.62)),
+    "pillow": Material("fabric", (0.78, 0.76, 0.72), (0.60, 0.58, 0.55)),
+    "trim": Material("plain", (0.74, 0.72, 0.67), (0.64, 0.62, 0.58)),
+    "dark": Material("plain", (0.030, 0.030, 0.033), (0.018, 0.018, 0.02)),
+    "metal": Material("plain", (0.42, 0.42, 0.43), (0.28, 0.28, 0.29)),
+    "screen": Material("view", (0.01, 0.012, 0.016), (0.05, 0.07, 0.10), 6.0),
+    "leaf": Material("blotches", (0.03, 0.10, 0.02), (0.12, 0.28, 0.06), 0.4),
+    "cardboard": Material("plain", (0.46, 0.32, 0.18), (0.36, 0.24, 0.13)),
+    "shade": Material("glow", (1.5, 1.2, 0.8), (1.1, 0.85, 0.5)),
+    "lamp": Material("glow", (3.0, 2.8, 2.4), (3.0, 2.8, 2.4)),
+    "sky": Material("glow", (3.0, 3.3, 3.7), (1.2, 1.6, 1.5), 0.4),
+}
 
 
 def room_materials(rng: np.random.Generator, category: str) -> dict[str, Material]:
@@ -180,48 +167,38 @@ def room_materials(rng: np.random.Generator, category: str) -> dict[str, Materia
 
     def pick(colours: tuple[Colour, ...]) -> Colour:
         base = colours[int(rng.integers(len(colours)))]
-        r, g, b = (c * rng.uniform(0.85, 1.15) for c in base)
-        return (float(r), float(g), float(b))
+        return tuple(float(c * rng.uniform(0.85, 1.15)) for c in base)
+
+    def shades(pattern: str, colour: Colour, first: float, second: float, scale_m: float = 1.0) -> Material:
+        one, other = (tuple(c * factor for c in colour) for factor in (first, second))
+        return Material(pattern, one, other, scale_m)
 
     wall, wood, panel, fabric = pick(_WALLS), pick(_WOODS), pick(_WOODS), pick(_FABRICS)
     accent_wall = pick(_ACCENTS) if rng.random() < 0.25 else wall
     floors = {
-        "wood": Material("wood", _dim(planks := pick(_WOODS), 1.15), _dim(planks, 0.55), 0.13),
-        "tiles": Material("tiles", stone := pick(_WALLS), _dim(stone, 0.45), float(rng.uniform(0.25, 0.5))),
-        "carpet": Material("fabric", _dim(wool := pick(_WALLS), 0.8), _dim(wool, 0.45), 1.0),
+        "wood": shades("wood", pick(_WOODS), 1.15, 0.55, 0.13),
+        "tiles": shades("tiles", pick(_WALLS), 1, 0.45, float(rng.uniform(0.25, 0.5))),
+        "carpet": shades("fabric", pick(_WALLS), 0.8, 0.45),
     }
     typical = {"kitchen": "tiles", "office": "carpet"}.get(category, "wood")
     floor = typical if rng.random() < 0.6 else str(rng.choice(list(floors)))
     if rng.random() < 0.4:
         panel = (0.70, 0.68, 0.64)
-    cover = "stripes" if rng.random() < 0.35 else "fabric"
+    cover, cover_scale_m = ("stripes", 0.12) if rng.random() < 0.35 else ("fabric", 1.0)
     accents = [pick(_ACCENTS) for _ in range(4)]
-    rug = pick(_FABRICS)
+    rug = shades("stripes", pick(_FABRICS), 1.8, 1, float(rng.uniform(0.15, 0.5)))
     return {
+        **_SAME_EVERYWHERE,
         "floor": floors[floor],
-        "ceiling": Material("plain", (0.80, 0.79, 0.76), (0.74, 0.73, 0.70)),
-        "wall": Material("plain", _dim(wall, 1.06), _dim(wall, 0.88)),
-        "accent_wall": Material("plain", _dim(accent_wall, 1.06), _dim(accent_wall, 0.88)),
-        "wood": Material("wood", _dim(wood, 1.2), _dim(wood, 0.6), 0.35),
-        "panel": Material("wood", _dim(panel, 1.1), _dim(panel, 0.75), 0.6),
-        "fabric": Material(cover, _dim(fabric, 1.5), _dim(fabric, 0.7), 0.12 if cover == "stripes" else 1.0),
-        "rug": Material("stripes", _dim(rug, 1.8), accents[3], float(rng.uniform(0.15, 0.5))),
-        "books": Material("books", (0.05, 0.04, 0.04), (0.75, 0.65, 0.55), 0.035),
-        "tiles": Material("tiles", (0.68, 0.68, 0.64), (0.40, 0.40, 0.38), 0.15),
-        "worktop": Material("blotches", _dim(top := pick(_WOODS), 0.9), _dim(top, 0.4), 0.3),
-        "white": Material("plain", (0.78, 0.77, 0.74), (0.66, 0.65, 0.62)),
-        "pillow": Material("fabric", (0.78, 0.76, 0.72), (0.60, 0.58, 0.55)),
-        "trim": Material("plain", (0.74, 0.72, 0.67), (0.64, 0.62, 0.58)),
-        "dark": Material("plain", (0.030, 0.030, 0.033), (0.018, 0.018, 0.02)),
-        "metal": Material("plain", (0.42, 0.42, 0.43), (0.28, 0.28, 0.29)),
-        "screen": Material("view", (0.01, 0.012, 0.016), (0.05, 0.07, 0.10), 6.0),
-        "leaf": Material("blotches", (0.03, 0.10, 0.02), (0.12, 0.28, 0.06), 0.4),
-        "cardboard": Material("plain", (0.46, 0.32, 0.18), (0.36, 0.24, 0.13)),
-        "shade": Material("glow", (1.5, 1.2, 0.8), (1.1, 0.85, 0.5)),
-        "lamp": Material("glow", (3.0, 2.8, 2.4), (3.0, 2.8, 2.4)),
-        "sky": Material("glow", (3.0, 3.3, 3.7), (1.2, 1.6, 1.5), 0.4),
-        "curtain": Material("stripes", _dim(cloth := pick(_FABRICS), 2.0), _dim(cloth, 1.0), 0.11),
-        "painting": Material("view", accents[0], accents[2], 1.0),
+        "wall": shades("plain", wall, 1.06, 0.88),
+        "accent_wall": shades("plain", accent_wall, 1.06, 0.88),
+        "wood": shades("wood", wood, 1.2, 0.6, 0.35),
+        "panel": shades("wood", panel, 1.1, 0.75, 0.6),
+        "fabric": shades(cover, fabric, 1.5, 0.7, cover_scale_m),
+        "rug": rug._replace(second=accents[3]),
+        "worktop": shades("blotches", pick(_WOODS), 0.9, 0.4, 0.3),
+        "curtain": shades("stripes", pick(_FABRICS), 2, 1, 0.11),
+        "painting": Material("view", accents[0], accents[2]),
         "poster": Material("view", accents[1], (0.7, 0.65, 0.55), 1.5),
-        **{f"accent{i}": Material("fabric", _dim(c, 1.2), _dim(c, 0.7)) for i, c in enumerate(accents)},
+        **{f"accent{i}": shades("fabric", colour, 1.2, 0.7) for i, colour in enumerate(accents)},
     }

@@ -1,4 +1,4 @@
-"""Light and the camera's flaws for the built-in rooms: from traced surfaces to an RGB image."""
+"""From traced surfaces to an RGB image: light, shadow, exposure, and the flaws of a real camera."""
 
 from __future__ import annotations
 
@@ -10,16 +10,7 @@ from numpy.typing import NDArray
 
 from hudepth.base.camera import Intrinsics
 from hudepth.data.rooms.materials import Material, pattern_weight
-from hudepth.data.rooms.raycast import (
-    BOX,
-    CYLINDER,
-    F32,
-    F64,
-    ROOM_FACES,
-    Solids,
-    View,
-    trace,
-)
+from hudepth.data.rooms.raycast import BOX, CYLINDER, F32, F64, ROOM_FACES, Solids, View, trace
 
 _SHADOW_REACH = 2.5
 _SHADOW_CELLS = 224
@@ -35,7 +26,7 @@ class Light(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """All that is needed to picture a room from any place in it."""
+    """All that is needed to render a room from any place in it."""
 
     room_size: F64
     """[3] metres."""
@@ -53,7 +44,7 @@ class Scene(NamedTuple):
 
 
 def shadow_map(room_size: F64, solids: Solids, light_position: F64) -> F32:
-    """Trace rays down from a light; a point further below than its cell says lies in shadow.
+    """Trace rays down from a light; a point further below it than the value of its cell lies in shadow.
 
     Cells are equally spaced in slope (horizontal over vertical distance), within ``+-_SHADOW_REACH``.
     """
@@ -63,7 +54,7 @@ def shadow_map(room_size: F64, solids: Solids, light_position: F64) -> F32:
 
 
 class _Hits(NamedTuple):
-    """What the rays of a view met, flat: n = h * w."""
+    """What the rays of a view hit, flattened: n = h * w."""
 
     point: F32
     """[3, n] world coordinates, metres."""
@@ -74,7 +65,7 @@ class _Hits(NamedTuple):
     surface: NDArray[np.int16]
 
 
-def _hits(scene: Scene, view: View, depth: F32, surface: NDArray[np.int16]) -> _Hits:
+def _find_hits(scene: Scene, view: View, depth: F32, surface: NDArray[np.int16]) -> _Hits:
     """Find point, normal and face coordinates of every hit, in the solid's own frame and in the world."""
     axes = view.axes.astype(np.float32)
     flat, z = surface.ravel(), depth.ravel()
@@ -117,20 +108,15 @@ def _round_normal(unit: F32, half: F32, *, tube: NDArray[np.bool_]) -> F32:
 
 def _albedo(scene: Scene, hits: _Hits, footprint: F32) -> tuple[F32, NDArray[np.bool_]]:
     """Return linear RGB [3, n] of every point, and which of them glow."""
-    material = scene.surface_material[hits.surface]
-    patterns = sorted({m.pattern for m in scene.materials})
-    pattern = np.array([patterns.index(m.pattern) for m in scene.materials], np.int8)[material]
-    first = np.array([m.first for m in scene.materials], np.float32)
-    change = np.array([m.second for m in scene.materials], np.float32) - first
-    scale = np.array([m.scale_m for m in scene.materials], np.float32)
-    albedo = np.empty((3, material.size), np.float32)
-    for number, name in enumerate(patterns):
-        i = np.flatnonzero(pattern == number)
+    number = scene.surface_material[hits.surface]
+    albedo = np.empty((3, number.size), np.float32)
+    for k, material in enumerate(scene.materials):
+        i = np.flatnonzero(number == k)
         if i.size:
-            m = material[i]
-            weight = pattern_weight(name, hits.u[i], hits.v[i], scale[m], footprint[i])
-            albedo[:, i] = first[m].T + weight * change[m].T
-    return np.maximum(albedo, 0), pattern == (patterns.index("glow") if "glow" in patterns else -1)
+            weight = pattern_weight(material, hits.u[i], hits.v[i], footprint[i])
+            first, second = np.array([material.first, material.second], np.float32)[..., None]
+            albedo[:, i] = first + weight * (second - first)
+    return np.maximum(albedo, 0), np.array([m.pattern == "glow" for m in scene.materials])[number]
 
 
 def _lit_fraction(scene: Scene, point: F32, upwards: F32) -> F32:
@@ -144,7 +130,7 @@ def _lit_fraction(scene: Scene, point: F32, upwards: F32) -> F32:
     inside = (a > 1) & (a < _SHADOW_CELLS - 2) & (b > 1) & (b < _SHADOW_CELLS - 2) & (drop > 0.05)
     i = np.flatnonzero(inside)
     a, b = a[i], b[i]
-    # A standing face spans drop / slope times a cell's width in one cell: with less leave it shades itself.
+    # Within one cell a vertical face spans drop / slope times the cell's width: with less tolerance it shades itself.
     slope = np.hypot(a - (_SHADOW_CELLS - 1) / 2, b - (_SHADOW_CELLS - 1) / 2)
     limit = drop[i] * (1 - (1 - np.abs(upwards[i])) * 1.5 / np.maximum(slope, 1)) - np.float32(0.03)
     across, along = a % 1, b % 1
@@ -176,10 +162,10 @@ def _corner_shade(scene: Scene, hits: _Hits) -> F32:
 
 
 def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[np.uint8], F32]:
-    """Picture a scene.
+    """Render a scene.
 
     Args:
-        scene: what there is to see.
+        scene: the room.
         view: the camera's rays.
         rng: draws exposure, white balance and sensor noise; geometry does not depend on it.
 
@@ -187,7 +173,7 @@ def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[
         image [h, w, 3] RGB, and depth [h, w] along the optical axis [m].
     """
     depth, surface = trace(view, scene.room_size, scene.solids)
-    hits = _hits(scene, view, depth, surface)
+    hits = _find_hits(scene, view, depth, surface)
     height, width = depth.shape
     flat = depth.ravel()
     facing = np.abs(np.einsum("kn,kn->n", view.origin.astype(np.float32)[:, None] - hits.point, hits.normal))
@@ -195,17 +181,12 @@ def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[
     albedo, glow = _albedo(scene, hits, flat * flat * pixel / np.maximum(facing, 1e-2))
 
     corner = _corner_shade(scene, hits)
+    sky = corner * (0.82 + 0.12 * hits.normal[1] + 0.08 * hits.normal[0])
     ceiling = _irradiance(scene.ceiling_light, hits) * _lit_fraction(scene, hits.point, hits.normal[1])
     fill = _irradiance(scene.fill_light, hits)
-    sky = corner * (0.82 + 0.12 * hits.normal[1] + 0.08 * hits.normal[0])
-    light = np.stack(
-        [
-            np.float32(scene.ambient[c]) * sky
-            + np.float32(scene.ceiling_light.colour[c]) * ceiling
-            + np.float32(scene.fill_light.colour[c]) * fill
-            for c in range(3)
-        ]
-    )
+    sources = ((scene.ambient, sky), (scene.ceiling_light.colour, ceiling), (scene.fill_light.colour, fill))
+    dark = np.zeros((3, flat.size), np.float32)
+    light = sum((colour.astype(np.float32)[:, None] * amount for colour, amount in sources), dark)
     light[:, glow] = 1
     return _expose((albedo * light).reshape(3, height, width), view, rng), depth
 
@@ -219,7 +200,7 @@ def _tone_curve() -> F32:
 
 
 def _expose(linear: F32, view: View, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Turn [3, h, w] linear light into [h, w, 3] 8 bit, with a lens's blur and a sensor's noise."""
+    """Turn linear light [3, h, w] into 8 bits [h, w, 3], with the blur of a lens and the noise of a sensor."""
     linear[:, 1:-1] = 0.5 * linear[:, 1:-1] + 0.25 * (linear[:, :-2] + linear[:, 2:])
     linear[:, :, 1:-1] = 0.5 * linear[:, :, 1:-1] + 0.25 * (linear[:, :, :-2] + linear[:, :, 2:])
     gain = 0.15 * rng.uniform(0.5, 1.6) / float(np.minimum(linear[1], 3.0).mean())

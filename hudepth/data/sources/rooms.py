@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from hudepth.base.camera import Intrinsics
 from hudepth.base.errors import ConfigError, DataError, did_you_mean
 from hudepth.data.rooms.fittings import CATEGORIES
+from hudepth.data.rooms.furnishing import VARIETIES
 from hudepth.data.rooms.materials import noise
 from hudepth.data.rooms.raycast import F32, pinhole_view
-from hudepth.data.rooms.scene import VARIETIES, build_room
+from hudepth.data.rooms.scene import build_room
 from hudepth.data.rooms.shading import render
 from hudepth.data.sources.base import RawPair, Record, Source
 
