@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hudepth.base.camera import Intrinsics
 from hudepth.data.rooms.raycast import (
     BOX,
     CYLINDER,
@@ -42,19 +41,6 @@ def take(solids: Solids, i: NDArray[np.intp]) -> Solids:
 def random_view(rng: np.random.Generator, *, height: int = 24, width: int = 32) -> View:
     axes = camera_axes(yaw=rng.normal(0, 0.3), pitch=rng.normal(-0.1, 0.1), roll=rng.normal(0, 0.1))
     return pinhole_view(rng.uniform([0.5, 1.0, 0.2], [3.5, 1.8, 1.2]), axes, height=height, width=width)
-
-
-def test_intrinsics_at_nyus_own_size_are_nyus() -> None:
-    assert Intrinsics.of_nyu(480, 640) == pytest.approx((518.857901, 519.469611, 325.582449, 253.736166))
-
-
-def test_intrinsics_keep_the_field_of_view_at_any_size() -> None:
-    fx, fy, cx, cy = Intrinsics.of_nyu(480, 640)
-    half = Intrinsics.of_nyu(240, 224)
-    # The outer edge of the image (-0.5) lies in the same direction at every size.
-    assert (half.cx + 0.5) / half.fx == pytest.approx((cx + 0.5) / fx)
-    assert (224 - 0.5 - half.cx) / half.fx == pytest.approx((640 - 0.5 - cx) / fx)
-    assert (half.cy + 0.5) / half.fy == pytest.approx((cy + 0.5) / fy)
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
