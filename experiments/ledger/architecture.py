@@ -14,7 +14,7 @@ from experiments.ledger.tables import SIDE_PX, TABLE_A1, ModelRow
 from hudepth.models.attention import TransformerBlock
 from hudepth.models.cost import parameters
 from hudepth.models.hybrid_unet import HybridUNet
-from hudepth.models.resnet import BasicBlock, ResNet18Trunk
+from hudepth.models.resnet import BasicBlock, ResNet18Encoder
 
 Shape = tuple[int, ...]
 
@@ -76,15 +76,15 @@ def compare_with_table_a1(network: nn.Module, *, table: Sequence[ModelRow] = TAB
 def variants_of_text() -> dict[str, int]:
     """Return the parameters of what section 3.1 describes, where it departs from table A1.
 
-    ``trunk to 7 x 7``: ResNet-18 with layer4. ``four transformer layers on it``: blocks of 512 channels. Neither has
+    ``encoder to 7 x 7``: ResNet-18 with layer4. ``four transformer layers on it``: blocks of 512 channels. Neither has
     a decoder yet. ``four layers on 14 x 14``: table A1's network with all four blocks on its deepest map instead.
     """
     with torch.device("meta"):
         layer4 = nn.Sequential(BasicBlock(256, 512, stride=2), BasicBlock(512, 512))
-        trunk = parameters(ResNet18Trunk()) + parameters(layer4)
+        encoder = parameters(ResNet18Encoder()) + parameters(layer4)
         without_attention = parameters(HybridUNet(attention="none"))
         return {
-            "trunk to 7 x 7": trunk,
+            "encoder to 7 x 7": encoder,
             "four transformer layers on it": 4 * parameters(TransformerBlock(512)),
             "four layers on 14 x 14": without_attention + 4 * parameters(TransformerBlock(256)),
         }

@@ -65,7 +65,7 @@ def table_a1_row() -> Row:
 def text_row() -> Row:
     """Section 3.1 against table A1."""
     variant = variants_of_text()
-    deep = variant["trunk to 7 x 7"] + variant["four transformer layers on it"]
+    deep = variant["encoder to 7 x 7"] + variant["four transformer layers on it"]
     flat = variant["four layers on 14 x 14"]
     stated = sum(row.parameters or 0 for row in tables.TABLE_A1)
     fits = tables.PARAMETERS in (deep, flat)
@@ -77,7 +77,7 @@ def text_row() -> Row:
         "transformer blocks, one of them on a skip",
         f"The text's encoder and attention alone have {deep:,} parameters; four layers on table A1's 14 x 14 map give "
         f"{flat:,} in all. Both miss the stated {tables.PARAMETERS:,}, which table A1's rows add up to ({stated:,})",
-        "Parameters of modules built for it: ResNet-18's layer4 behind the trunk, TransformerBlock(512) four times; "
+        "Parameters of modules built for it: ResNet-18's layer4 behind the encoder, TransformerBlock(512) four times; "
         "and HybridUNet(attention=none) with TransformerBlock(256) four times. Table A1 is what hudepth builds.",
         "holds" if fits else "contradicted",
         {**variant, "text_without_decoder": deep, "sum_of_table_a1": stated},

@@ -37,7 +37,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "the same, stem and layer1 frozen": {
         "bf16": True, "channels_last": True, "arithmetic": "merged", "keep": True, "freeze": True,
     },
-    "the same, trunk frozen": {
+    "the same, encoder frozen": {
         "bf16": True, "channels_last": True, "arithmetic": "merged", "keep": True, "freeze": "all",
     },
     "the same at 160 x 160": {
@@ -68,9 +68,7 @@ def serve(batch: int) -> None:
     if options.get("channels_last"):
         net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if options.get("freeze"):
-        parts = ("conv1", "bn1", "layer1", *(("layer2", "layer3") if options["freeze"] == "all" else ()))
-        for name in parts:
-            getattr(net.trunk, name).requires_grad_(requires_grad=False)
+        net.encoder.freeze(4 if options["freeze"] == "all" else 2)
     size = options.get("size", 224)
     image, truth = torch.randn(batch, 3, size, size), torch.rand(batch, 1, size, size)
     valid, loss = truth > 0, BADCL()

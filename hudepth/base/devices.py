@@ -87,7 +87,7 @@ def without_known_warnings() -> Iterator[None]:
         warnings.filterwarnings("ignore", ".*does not have many workers.*")  # reading a store needs none
         warnings.filterwarnings("ignore", ".*exists and is not empty.*")  # the run directory, by design
         warnings.filterwarnings("ignore", ".*LeafSpec.*")  # between Lightning and torch
-        warnings.filterwarnings("ignore", ".*in eval mode at the start.*")  # model.trunk_norm=frozen, by design
+        warnings.filterwarnings("ignore", ".*in eval mode at the start.*")  # model.encoder_norm=frozen, by design
         for name in ("lightning.pytorch", "lightning.fabric"):
             logging.getLogger(name).setLevel(logging.WARNING)  # their greetings
         yield

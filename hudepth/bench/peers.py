@@ -57,12 +57,12 @@ class _Depth(nn.Module):
 
 def _depth_anything(_size: Size) -> nn.Module:
     hub: Any = importlib.import_module("transformers")
-    trunk = hub.Dinov2Config(
+    encoder = hub.Dinov2Config(
         hidden_size=384, num_hidden_layers=12, num_attention_heads=6, image_size=518, patch_size=14,
         out_indices=[3, 6, 9, 12], apply_layernorm=True, reshape_hidden_states=False,
     )  # fmt: skip
     config = hub.DepthAnythingConfig(
-        backbone_config=trunk, reassemble_hidden_size=384, patch_size=14, neck_hidden_sizes=[48, 96, 192, 384],
+        backbone_config=encoder, reassemble_hidden_size=384, patch_size=14, neck_hidden_sizes=[48, 96, 192, 384],
         fusion_hidden_size=64, head_in_index=-1, head_hidden_size=32,
     )  # fmt: skip
     return _Depth(hub.DepthAnythingForDepthEstimation(config))

@@ -51,7 +51,7 @@ def write_bundle(
     (folder / WEIGHTS).write_bytes(save(state, metadata={"format": "pt", "hudepth": info.to_json()}))
     config = {key: checkpoint.config[key] for key in PARTS if key in checkpoint.config}
     if isinstance(config.get("model"), dict) and "weights" in config["model"]:
-        config["model"] = {**config["model"], "weights": None}  # the trunk's start, which may be a path
+        config["model"] = {**config["model"], "weights": None}  # the encoder's initial weights, which may be a path
     if isinstance(config.get("data"), dict):
         config["data"] = {key: None if key in PLACES else value for key, value in config["data"].items()}
     stated = {

@@ -1,7 +1,9 @@
 """Networks from a normalised RGB image to unit depth."""
 
+from hudepth.models.encoder import Encoder, Stage
 from hudepth.models.hybrid_unet import HybridUNet
+from hudepth.models.resnet import ResNet18Encoder
 from hudepth.models.resnet18_unet import ResNet18UNet
 from hudepth.models.tiny import TinyUNet
 
-__all__ = ["HybridUNet", "ResNet18UNet", "TinyUNet"]
+__all__ = ["Encoder", "HybridUNet", "ResNet18Encoder", "ResNet18UNet", "Stage", "TinyUNet"]

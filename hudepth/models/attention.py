@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.options import convert
 from hudepth.models.options import ACTIVATIONS, choose
-
-POSITIONS = ("none", "sine")
-"""Encodings of where a token stands, none of which has parameters: table A1 counts none."""
 
 
 def sine_positions(channels: int, height: int, width: int) -> Float[Tensor, "c h w"]:
     """Return sines and cosines of row and column, each over half the channels (Carion et al. 2020, DETR).
 
-    Half of each half are sines, half cosines, of angles that fall geometrically from 1 to 1/10000 a pixel (Vaswani et
+    Half of each half are sines, half cosines, of angles that fall geometrically from 1 to 1/10000 per pixel (Vaswani et
     al. 2017).
 
     Args:
@@ -27,7 +26,7 @@ def sine_positions(channels: int, height: int, width: int) -> Float[Tensor, "c h
         width: columns.
 
     Returns:
-        In float64, so that it is exact in whatever it is added to.
+        In float64, to be exact in whatever it is added to.
     """
     count = channels // 4
     frequency = torch.exp(torch.arange(count, dtype=torch.float64) * (-math.log(10_000) / count))[:, None]
@@ -47,8 +46,8 @@ class TransformerBlock(nn.Module):
         heads: attention heads; must divide ``channels``. The paper does not state it.
         expansion: width of the feed-forward layer over that of a token (table A1: 4).
         activation: of the feed-forward layer: relu, gelu or silu. The paper does not state it.
-        positions: what tells tokens where they stand: "none" (figure 4 shows nothing), or "sine", which is added to
-            queries and keys. ``channels`` must then be a multiple of 4.
+        positions: position encoding: "none" (figure 4 shows nothing), or "sine", which is added to queries and keys
+            and needs a multiple of 4 channels. Neither has parameters: table A1 counts none.
 
     Raises:
         ConfigError: if ``heads`` does not divide ``channels``, or the activation or the encoding is unknown.
@@ -58,7 +57,7 @@ class TransformerBlock(nn.Module):
         self, channels: int, *, heads: int = 8, expansion: int = 4, activation: str = "relu", positions: str = "none"
     ) -> None:
         super().__init__()
-        self.positions = choose("model.attention_positions", positions, dict.fromkeys(POSITIONS, positions))
+        self.positions = convert("model.attention_positions", positions, Literal["none", "sine"], default="none")
         if heads < 1 or channels % heads:
             usable = [n for n in (1, 2, 4, 8, 16, 32, 64) if channels % n == 0]
             raise ConfigError(
@@ -74,12 +73,12 @@ class TransformerBlock(nn.Module):
         self.norm2 = nn.LayerNorm(channels)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Let every position of the map look at every other."""
+        """Attend from every position of the map to every other."""
         tokens: Tensor = x.flatten(2).transpose(1, 2)
-        asked = tokens
-        if self.positions == "sine":  # not added to the values: they go on to the decoder
-            where = sine_positions(*x.shape[1:]).to(x)
-            asked = tokens + where.flatten(1).T
-        tokens = self.norm1(tokens + self.attention(asked, asked, tokens, need_weights=False)[0])
+        queries = tokens
+        if self.positions == "sine":  # not added to the values: they reach the decoder
+            encoding = sine_positions(*x.shape[1:]).to(x)
+            queries = tokens + encoding.flatten(1).T
+        tokens = self.norm1(tokens + self.attention(queries, queries, tokens, need_weights=False)[0])
         tokens = self.norm2(tokens + self.feed_forward(tokens))
         return tokens.transpose(1, 2).reshape(x.shape)

@@ -1,12 +1,13 @@
-"""The decoder of table A1: up blocks that join a coarse map with a skip, and the head that ends in unit depth.
+"""The decoder of table A1: up blocks that join a coarse map with a skip, and the head.
 
-Two of its steps are linear and follow each other with nothing between them: upsampling and convolution, and the head's
-two convolutions. Each pair is one smaller convolution, whose weights are sums of the original ones. ``arithmetic`` says
-which is computed; the parameters, and but for rounding the results and gradients, are the same.
+Two pairs of its steps are linear with nothing between them: upsampling and convolution, and the head's two
+convolutions. Each pair equals one smaller convolution, whose weights are sums of the original ones. ``arithmetic``
+selects what is computed; the parameters are the same, and so are results and gradients up to rounding.
 """
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Literal
 
 import torch
@@ -14,11 +15,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hudepth.base.options import convert
+
 UpsampleMode = Literal["nearest", "bilinear"]
 Arithmetic = Literal["plain", "merged"]
-
-ARITHMETIC = ("plain", "merged")
-"""``plain``: step by step, as table A1 lists them. ``merged``: linear steps that follow each other as one."""
+"""``plain``: step by step, as table A1 lists them. ``merged``: consecutive linear steps as one."""
 
 
 class UpBlock(nn.Module):
@@ -28,8 +29,11 @@ class UpBlock(nn.Module):
         channels_in: of the coarse map.
         channels_skip: of the skip, which has twice the coarse map's size.
         channels_out: of the result.
-        upsample: ``nearest`` (what figure 4's UpSampling2D does by default) or ``bilinear``.
-        arithmetic: one of :data:`ARITHMETIC`; bilinear upsampling is always ``plain``.
+        upsample: ``nearest`` (the default of figure 4's UpSampling2D) or ``bilinear``.
+        arithmetic: ``plain`` or ``merged``; bilinear upsampling is always ``plain``.
+
+    Raises:
+        ConfigError: for an unknown option.
     """
 
     def __init__(
@@ -38,11 +42,12 @@ class UpBlock(nn.Module):
         channels_skip: int,
         channels_out: int,
         *,
-        upsample: UpsampleMode = "nearest",
-        arithmetic: Arithmetic = "plain",
+        upsample: str = "nearest",
+        arithmetic: str = "plain",
     ) -> None:
         super().__init__()
-        self.upsample = upsample
+        self.upsample = convert("model.upsample", upsample, UpsampleMode, default="nearest")
+        convert("model.arithmetic", arithmetic, Arithmetic, default="plain")
         self.merged = arithmetic == "merged" and upsample == "nearest"
         self.channels_in = channels_in
         self.conv1 = nn.Conv2d(channels_in + channels_skip, channels_out, 3, padding=1)
@@ -95,18 +100,11 @@ def split_kernel(
     return coarse.transpose(0, 1), weight[:, channels_in:]
 
 
-def is_usual_head(up: nn.ConvTranspose2d, head: nn.Conv2d) -> bool:
-    """Whether these are layers that :func:`joint_head` can join."""
-    return (up.kernel_size, up.stride, up.padding) == ((4, 4), (2, 2), (1, 1)) and (
-        (head.kernel_size, head.stride, head.padding, head.out_channels) == ((3, 3), (1, 1), (1, 1), 1)
-    )
-
-
 def joint_head(
     up_weight: Float[Tensor, "c_in c_mid 4 4"],
-    up_bias: Float[Tensor, " c_mid"] | None,
+    up_bias: Float[Tensor, " c_mid"],
     head_weight: Float[Tensor, "1 c_mid 3 3"],
-    head_bias: Float[Tensor, " 1"] | None,
+    head_bias: Float[Tensor, " 1"],
 ) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
     """Join a transposed convolution (stride 2, padding 1) and the 3 x 3 convolution to one channel that follows it.
 
@@ -124,33 +122,55 @@ def joint_head(
             tap = torch.einsum("iokl,o->ikl", up_weight, head_weight[0, :, row, column])
             joint = joint + functional.pad(tap, (2 - column, column, 2 - row, row))
     phases = joint.reshape(-1, 3, 2, 3, 2).flip(1, 3).permute(2, 4, 0, 1, 3).flatten(0, 1)
-    bias = up_weight.new_zeros(1) if head_bias is None else head_bias
-    if up_bias is not None:
-        bias = bias + head_weight[0].sum((1, 2)) @ up_bias
+    bias = head_bias + head_weight[0].sum((1, 2)) @ up_bias
     return phases, bias.expand(4)
 
 
-def run_head(
-    up: nn.ConvTranspose2d,
-    head: nn.Conv2d,
-    x: Float[Tensor, "b c h w"],
-    *,
-    joint: tuple[Tensor, Tensor],
-) -> Float[Tensor, "b 1 2*h 2*w"]:
-    """Return ``head(up(x))`` by the joint convolution, and by the two steps along the border, on strips of two pixels.
+class Head(nn.Module):
+    """x2 upsampling by a transposed convolution, then a 3x3 convolution.
 
     Args:
-        up: the first step.
-        head: the second.
-        x: the last up block's map.
-        joint: what :func:`joint_head` makes of them.
+        channels_in: of the last up block.
+        channels_out: of the result.
+        width: channels between the two steps.
+        arithmetic: ``plain`` or ``merged``; several output channels are always ``plain``.
     """
 
-    def steps(strip: Tensor) -> Tensor:
-        result: Tensor = head(up(strip))
+    def __init__(self, channels_in: int, channels_out: int = 1, *, width: int = 32, arithmetic: str = "plain") -> None:
+        super().__init__()
+        self.up = nn.ConvTranspose2d(channels_in, width, 4, stride=2, padding=1)
+        self.conv = nn.Conv2d(width, channels_out, 3, padding=1)
+        self.merged = arithmetic == "merged" and channels_out == 1
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c_out 2*h 2*w"]:
+        """Return a map of twice the size."""
+        if not self.merged:
+            return self.steps(x)
+        # sums of many small products, in full precision; autocast does not support the meta device
+        with nullcontext() if x.is_meta else torch.autocast(x.device.type, enabled=False):
+            joint = self.joint()
+        return self.run_joint(x, joint)
+
+    def steps(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c_out 2*h 2*w"]:
+        """Run the two convolutions one after the other."""
+        result: Tensor = self.conv(self.up(x))
         return result
 
-    inside = functional.pixel_shuffle(functional.conv2d(x, *joint, padding=1), 2)[:, :, 1:-1, 1:-1]
-    top, bottom = steps(x[:, :, :2])[:, :, :1], steps(x[:, :, -2:])[:, :, -1:]
-    left, right = steps(x[..., :2])[:, :, 1:-1, :1], steps(x[..., -2:])[:, :, 1:-1, -1:]
-    return torch.cat([top, torch.cat([left, inside, right], dim=3), bottom], dim=2)
+    def joint(self, *, double: bool = False) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
+        """Return kernel and bias of :func:`joint_head`, in float64 if ``double``."""
+        assert self.up.bias is not None
+        assert self.conv.bias is not None
+        parts = (self.up.weight, self.up.bias, self.conv.weight, self.conv.bias)
+        return joint_head(*(part.double() if double else part for part in parts))
+
+    def run_joint(self, x: Float[Tensor, "b c h w"], joint: tuple[Tensor, Tensor]) -> Float[Tensor, "b 1 2*h 2*w"]:
+        """Run the joint convolution, and the two steps along the border, on strips of two pixels.
+
+        Args:
+            x: the last up block's map.
+            joint: of :func:`joint_head`.
+        """
+        inside = functional.pixel_shuffle(functional.conv2d(x, *joint, padding=1), 2)[:, :, 1:-1, 1:-1]
+        top, bottom = self.steps(x[:, :, :2])[:, :, :1], self.steps(x[:, :, -2:])[:, :, -1:]
+        left, right = self.steps(x[..., :2])[:, :, 1:-1, :1], self.steps(x[..., -2:])[:, :, 1:-1, -1:]
+        return torch.cat([top, torch.cat([left, inside, right], dim=3), bottom], dim=2)

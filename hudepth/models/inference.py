@@ -1,7 +1,7 @@
-"""A trained network, rewritten to compute the same in less time.
+"""Rewrites a trained network to compute the same in less time.
 
-Nothing here is approximate: batch norm is folded into convolutions, and linear steps that follow each other become one
-(a convolution of an upsampled map, the head's two layers). What remains is rounding, which is measured on the spot.
+Nothing is approximated: batch norm is folded into convolutions, and consecutive linear steps become one (a convolution
+of an upsampled map, the head's two layers). Results differ by rounding only, which is checked each time.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hudepth.base.console import log
-from hudepth.models.decoder import UpBlock, is_usual_head, joint_head, run_head, split_kernel
+from hudepth.models.decoder import Head, UpBlock, split_kernel
 
 TOLERANCE = 1e-5
-"""How far the rewritten network's unit depth may be from the original's; 0.1 mm where unit depth 1 is 10 m."""
+"""Largest difference in unit depth from the original network; 0.1 mm at a maximum depth of 10 m."""
 
 
 def inference_form(net: nn.Module, *, size: tuple[int, int]) -> nn.Module:
     """Return a copy of ``net`` in evaluation mode that predicts the same in less time.
 
-    On two CPU cores the hybrid UNet is then 1.3 to 1.8 times as fast (``experiments/speed``). The copy is compared with
-    the original on an image of noise; should it differ, as a network of somebody else's might, it is the network as it
-    was.
+    On two CPU cores this makes the hybrid UNet 1.3 to 1.8 times as fast (``experiments/speed``). The copy is compared
+    with the original on an image of noise; if it differs, as a custom network might, a plain copy is returned.
 
     Args:
-        net: normalised image to unit depth; it is not changed.
-        size: (height, width) of the images it takes.
+        net: normalised image to unit depth; not changed.
+        size: (height, width) of its images.
 
     Returns:
         A network whose parameters need no gradients, laid out channels-last.
@@ -67,14 +66,12 @@ def _merge_linear_steps(net: nn.Module) -> None:
         for name, child in list(module.named_children()):
             if isinstance(child, UpBlock) and child.upsample == "nearest" and isinstance(child.bn1, nn.Identity):
                 setattr(module, name, MergedUpBlock(child))
-        up, head = getattr(module, "head_up", None), getattr(module, "head", None)
-        if isinstance(up, nn.ConvTranspose2d) and isinstance(head, nn.Conv2d) and is_usual_head(up, head):
-            module.head_up, module.head = nn.Identity(), MergedHead(up, head)
-            module.merged = False  # type: ignore[assignment]  # it is now, for good
+            elif isinstance(child, Head) and child.conv.out_channels == 1:
+                setattr(module, name, MergedHead(child))
 
 
 class MergedUpBlock(nn.Module):
-    """An up block of which the coarse map is never upsampled (:func:`hudepth.models.decoder.split_kernel`).
+    """An up block that never upsamples the coarse map (:func:`hudepth.models.decoder.split_kernel`).
 
     Args:
         block: with nearest upsampling and batch norm folded.
@@ -109,23 +106,21 @@ class MergedHead(nn.Module):
     """The head's two convolutions as one (:func:`hudepth.models.decoder.joint_head`).
 
     Args:
-        up: kernel 4, stride 2, padding 1.
-        head: kernel 3, padding 1, one output channel.
+        head: with one output channel.
     """
 
-    def __init__(self, up: nn.ConvTranspose2d, head: nn.Conv2d) -> None:
+    def __init__(self, head: Head) -> None:
         super().__init__()
-        self.up, self.head = up, head
-        up_bias, head_bias = (None if b is None else b.detach().double() for b in (up.bias, head.bias))
-        weight, bias = joint_head(up.weight.detach().double(), up_bias, head.weight.detach().double(), head_bias)
-        self.joint = nn.Conv2d(up.in_channels, 4, 3, padding=1)
+        self.head = head
+        self.joint = nn.Conv2d(head.up.in_channels, 4, 3, padding=1)
         assert self.joint.bias is not None
         with torch.no_grad():
+            weight, bias = head.joint(double=True)
             self.joint.weight.copy_(weight)
             self.joint.bias.copy_(bias)
         self.requires_grad_(requires_grad=False)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 2*h 2*w"]:
-        """Return what ``head(up(x))`` returns."""
+        """Return what the head returns."""
         assert self.joint.bias is not None
-        return run_head(self.up, self.head, x, joint=(self.joint.weight, self.joint.bias))
+        return self.head.run_joint(x, (self.joint.weight, self.joint.bias))

@@ -1,16 +1,16 @@
-"""Named choices of the models: what a string in the configuration stands for."""
+"""Named choices of the models: activations and outputs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.options import Choice, convert
 
 T = TypeVar("T")
 
@@ -18,11 +18,11 @@ ACTIVATIONS: Mapping[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "gelu": n
 """Between the two layers of a transformer block's feed-forward part."""
 
 NEAREST_UNIT_DEPTH = 0.01
-"""What the outputs ``log`` and ``bins`` begin with: 10 cm where the unit is 10 m."""
+"""The least depth of the outputs ``log`` and ``bins``: 10 cm at a maximum depth of 10 m."""
 
 
 class LogDepth(nn.Module):
-    """Unit depth between :data:`NEAREST_UNIT_DEPTH` and 1, evenly in its logarithm: near depths get as much room."""
+    """Unit depth between :data:`NEAREST_UNIT_DEPTH` and 1, evenly in its logarithm, giving near depths as much room."""
 
     def forward(self, x: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Return unit depth."""
@@ -30,13 +30,13 @@ class LogDepth(nn.Module):
 
 
 class DepthBins(nn.Module):
-    """Expected unit depth of a distribution over fixed depths, which are evenly spaced in the logarithm.
+    """Expected unit depth of a distribution over fixed depths, evenly spaced in the logarithm.
 
     (Classification as in Cao et al. 2017, and the expectation as in AdaBins, Bhat et al. 2021, without adaption.)
     """
 
     channels_in = 64
-    """How many channels the last convolution must have: one for each depth."""
+    """Output channels of the last convolution, one per depth."""
 
     centres: Tensor
 
@@ -58,15 +58,13 @@ OUTPUTS: Mapping[str, Callable[[], nn.Module]] = {
     "log": LogDepth,
     "bins": DepthBins,
 }
-"""From the last convolution to unit depth. Only sigmoid, log and bins keep it in [0, 1] by themselves."""
+"""From the last convolution to unit depth. Only sigmoid, log and bins keep it in [0, 1]."""
 
 
 def choose(key: str, name: str, choices: Mapping[str, T]) -> T:
     """Return ``choices[name]``.
 
     Raises:
-        ConfigError: if there is no such choice; the message names ``key`` and the choices.
+        ConfigError: if there is no such choice.
     """
-    if name not in choices:
-        raise ConfigError(f"{key}: no '{name}'.{did_you_mean(name, choices)} Pass one of {', '.join(choices)}.")
-    return choices[name]
+    return choices[convert(key, name, Annotated[str, Choice(tuple(choices))])]

@@ -5,14 +5,16 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hudepth.models.hybrid_unet import STRIDE, check_size
+from hudepth.models.unet import check_size
+
+STRIDE = 16
 
 
 class TinyUNet(nn.Module):
     """A few thousand parameters with the hybrid UNet's interface: normalised RGB in, unit depth out.
 
     Args:
-        channels: width of its only hidden layers.
+        channels: width of its only hidden layer.
     """
 
     def __init__(self, *, channels: int = 8) -> None:
@@ -29,6 +31,6 @@ class TinyUNet(nn.Module):
         Raises:
             ConfigError: if a side of the image is not a multiple of 16.
         """
-        check_size(*image.shape[-2:])
+        check_size(*image.shape[-2:], stride=STRIDE)
         unit_depth: Tensor = self.output(self.decode(self.relu(self.norm(self.encode(image)))))
         return unit_depth

@@ -19,7 +19,8 @@ from hudepth.runs import bundles, run_dir
 
 KEY = "hudepth"
 """Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""
-VERSION = 1
+VERSION = 2
+"""1: before the encoder and the head were renamed."""
 NET_PREFIX = "net."
 
 
@@ -82,7 +83,7 @@ class Checkpoint:
         """
         model = dict(self.config["model"])
         if "weights" in model:
-            model["weights"] = None  # the trunk's start does not matter any more
+            model["weights"] = None  # no longer needed
         only = object if trust else nn.Module
         if not trust:
             if sum(tensor.nbytes for tensor in self.state.values()) > self.size_bytes:
@@ -207,7 +208,9 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         tensors, run = content["state_dict"], run_dir.run_of(path.resolve())
         epoch = content["epoch"] + 1 if isinstance(content.get("epoch"), int) else None
     if own.get("version") != VERSION:
-        raise CheckpointError(f"'{path}' has checkpoint version {own.get('version')}; this hudepth reads {VERSION}.")
+        raise CheckpointError(
+            f"'{path}' has format version {own.get('version')}, this hudepth reads {VERSION}. {_fix_version(own)}"
+        )
     config, split, data = own.get("config"), own.get("split"), own.get("data")
     if not (
         isinstance(config, dict)
@@ -231,6 +234,12 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         state=state,
         size_bytes=size_bytes,
     )
+
+
+def _fix_version(own: dict[str, Any]) -> str:
+    if own.get("version") == 1:
+        return "It was written by a pre-release of hudepth 0.1: train or export again with this version."
+    return "Use the version of hudepth that wrote it, or train again with this one."
 
 
 def _is_state(value: object) -> bool:

@@ -57,5 +57,7 @@ def part_bound_to_length(config: Mapping[str, Any]) -> str:
         return "the learning-rate schedule"
     if config["data"].get("progressive"):
         return "the progressive resolution"
-    freezes = [extra for extra in config["callbacks"].get("extra") or [] if "FreezeTrunk" in str(extra.get("_target_"))]
-    return "FreezeTrunk" if freezes else ""
+    freezes = [
+        extra for extra in config["callbacks"].get("extra") or [] if "FreezeEncoder" in str(extra.get("_target_"))
+    ]
+    return "FreezeEncoder" if freezes else ""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,12 @@ from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE, lineage, refuse_training_pairs
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.score import score_checkpoint
+from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint
 from hudepth.training.checks import MEMORY_FORMATS, check_input, check_monitor
 from hudepth.training.module import DepthModule
+from hudepth.training.optim import GroupedAdamW
 from hudepth.training.schedules import StepSchedule
 from hudepth.training.trainer import build_callbacks, build_run_trainer
 
@@ -155,6 +156,12 @@ def build_module(
     """
     distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
 
+    def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> Optimizer:
+        grouped = str(config["optim"]["_target_"]).startswith(f"{GroupedAdamW.__module__}.")
+        extra = {"encoder": find_encoder(net)} if grouped else {}
+        built: Optimizer = instantiate(config["optim"], parameters, trust=trust, only=Optimizer, **extra)
+        return built
+
     def schedule(optimizer: Optimizer, total_steps: int) -> LRScheduler:
         knows_length = str(config["schedule"]["_target_"]).startswith(f"{StepSchedule.__module__}.")
         extra = {"total_steps": total_steps} if knows_length else {}
@@ -165,7 +172,7 @@ def build_module(
         net,
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
-        optimizer=partial(instantiate, config["optim"], trust=trust, only=Optimizer),
+        optimizer=optimizer,
         distill=instantiate(distill, trust=trust, only=nn.Module) if is_given(distill) else None,
         scheduler=schedule if is_given(config["schedule"]) else None,
         record={

@@ -1,4 +1,4 @@
-"""Training without the trunk's first stages, as long as the rest has much to learn."""
+"""Training without the encoder's first stages while the rest has much to learn."""
 
 from __future__ import annotations
 
@@ -8,57 +8,62 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hudepth.base.errors import ConfigError
-
-STAGES = ("stem", "layer1", "layer2", "layer3")
-"""Of the trunk, from the image on; the stem is its first convolution and batch norm."""
+from hudepth.models.encoder import Encoder, find_encoder
 
 
-class FreezeTrunk(Callback):
-    """Keeps the first stages of a pretrained trunk as they are until a share of the epochs is over.
+class FreezeEncoder(Callback):
+    """Freezes the first stages of a pretrained encoder for a share of the epochs.
 
-    Their gradients are not computed, which is where the time is saved. Statistics of batch norm go on being gathered;
-    ``model.trunk_norm=frozen`` is for that.
+    Their gradients are not computed, which saves time. Batch norm still updates its statistics;
+    ``model.encoder_norm=frozen`` prevents that.
 
     Args:
-        until: share of the epochs, in (0, 1]; 1 keeps them throughout.
-        stages: the first of :data:`STAGES`, without a gap: gradients must pass through what comes after.
+        until: share of the epochs, in (0, 1]; 1 freezes them throughout.
+        stages: names of the encoder's first stages, without a gap: gradients must pass through what comes after.
 
     Raises:
-        ConfigError: for other stages or shares.
+        ConfigError: if ``until`` is out of range.
     """
 
     def __init__(self, *, until: float = 0.3, stages: Sequence[str] = ("stem", "layer1")) -> None:
         if not 0 < until <= 1:
-            raise ConfigError(f"FreezeTrunk.until: {until} is not a share of the epochs, in (0, 1].")
-        if not stages or tuple(stages) != STAGES[: len(stages)]:
-            raise ConfigError(
-                f"FreezeTrunk.stages: {list(stages)} are not the first stages of the trunk. Pass the first few of "
-                f"{list(STAGES)}."
-            )
-        self.until, self.stages = until, tuple(stages)
+            raise ConfigError(f"FreezeEncoder.until: {until} is not a share of the epochs, in (0, 1].")
+        self.until, self.stages = until, list(stages)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Freeze before a strategy looks for what it has to share among processes."""
+        """Freeze before a strategy looks for what it has to share among processes.
+
+        Raises:
+            ConfigError: if the network has no encoder, or the stages are not its first ones.
+        """
         if stage != "fit":
             return
-        if getattr(getattr(pl_module, "net", None), "trunk", None) is None:
-            raise ConfigError("FreezeTrunk: this network has no trunk. Leave it out of callbacks.extra.")
+        known = [stage.name for stage in _encoder(pl_module).stages]
+        if not self.stages or self.stages != known[: len(self.stages)]:
+            raise ConfigError(
+                f"FreezeEncoder.stages: {self.stages} are not the first stages of the encoder. Pass the first few of "
+                f"{known}."
+            )
         if self.until < 1 and trainer.world_size > 1:
             raise ConfigError(
-                "FreezeTrunk.until: several processes would not share what is let go later. Pass until=1, or "
+                "FreezeEncoder.until: stages that train later would not be shared among processes. Pass until=1, or "
                 "trainer.devices=1."
             )
         if self.until < 1 and (trainer.max_epochs or -1) < 0:
-            raise ConfigError("FreezeTrunk.until: a share of the epochs needs trainer.max_epochs. Pass it, or until=1.")
-        self._freeze(pl_module, frozen=True)
+            raise ConfigError(
+                "FreezeEncoder.until: a share of the epochs needs trainer.max_epochs. Pass it, or until=1."
+            )
+        _encoder(pl_module).freeze(len(self.stages))
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Let go, if it is time."""
+        """Train the stages again, if it is time."""
         if self.until < 1:
-            self._freeze(pl_module, frozen=trainer.current_epoch < round(self.until * (trainer.max_epochs or 0)))
+            frozen = trainer.current_epoch < round(self.until * (trainer.max_epochs or 0))
+            _encoder(pl_module).freeze(len(self.stages), frozen=frozen)
 
-    def _freeze(self, pl_module: LightningModule, *, frozen: bool) -> None:
-        net: Any = pl_module.net
-        names = [name for stage in self.stages for name in (("conv1", "bn1") if stage == "stem" else (stage,))]
-        for name in names:
-            getattr(net.trunk, name).requires_grad_(requires_grad=not frozen)
+
+def _encoder(pl_module: Any) -> Encoder:
+    encoder = find_encoder(pl_module.net)
+    if encoder is None:
+        raise ConfigError("FreezeEncoder: this network has no encoder. Leave it out of callbacks.extra.")
+    return encoder

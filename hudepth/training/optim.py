@@ -11,19 +11,17 @@ from torch.optim import AdamW
 
 from hudepth.base.errors import ConfigError
 
-TRUNK = "trunk."
-"""Prefix of the parameters of the pretrained part; see :class:`hudepth.models.resnet.ResNet18Trunk`."""
-
 
 class GroupedAdamW(AdamW):
-    """AdamW with a learning rate of its own for the trunk, and no weight decay on biases and norms.
+    """AdamW with a separate learning rate for the encoder, and no weight decay on biases and norms.
 
-    Groups are named ``trunk``, ``trunk_no_decay``, ``rest`` and ``rest_no_decay``; empty ones are left out.
+    Groups are named ``encoder``, ``encoder_no_decay``, ``rest`` and ``rest_no_decay``; empty ones are left out.
 
     Args:
         params: parameters with their names.
-        lr: learning rate of all but the trunk.
-        trunk_lr_factor: the trunk's learning rate over ``lr``; 0 keeps the trunk as it is.
+        lr: learning rate of all but the encoder.
+        encoder: whose parameters get a rate of their own; None if the network has no encoder.
+        encoder_lr_factor: the encoder's learning rate over ``lr``; 0 leaves the encoder unchanged.
         weight_decay: of matrices and kernels.
         **options: further arguments of :class:`torch.optim.AdamW`, for example ``fused``.
 
@@ -36,22 +34,24 @@ class GroupedAdamW(AdamW):
         params: Iterable[tuple[str, nn.Parameter]],
         *,
         lr: float,
-        trunk_lr_factor: float = 1.0,
+        encoder: nn.Module | None = None,
+        encoder_lr_factor: float = 1.0,
         weight_decay: float = 0.01,
         **options: Any,
     ) -> None:
-        if not (math.isfinite(trunk_lr_factor) and trunk_lr_factor >= 0):
-            raise ConfigError(f"optim.trunk_lr_factor: {trunk_lr_factor} is not a number of at least 0.")
+        if not (math.isfinite(encoder_lr_factor) and encoder_lr_factor >= 0):
+            raise ConfigError(f"optim.encoder_lr_factor: {encoder_lr_factor} is not a number of at least 0.")
+        inside = set() if encoder is None else {id(parameter) for parameter in encoder.parameters()}
         groups: dict[str, list[tuple[str, nn.Parameter]]] = {}
         for name, parameter in params:
-            part = "trunk" if name.startswith(TRUNK) else "rest"
+            part = "encoder" if id(parameter) in inside else "rest"
             groups.setdefault(part if parameter.ndim > 1 else f"{part}_no_decay", []).append((name, parameter))
         super().__init__(
             [
                 {
                     "params": members,
                     "name": name,
-                    "lr": lr * (trunk_lr_factor if name.startswith("trunk") else 1.0),
+                    "lr": lr * (encoder_lr_factor if name.startswith("encoder") else 1.0),
                     "weight_decay": 0.0 if name.endswith("_no_decay") else weight_decay,
                 }
                 for name, members in groups.items()

@@ -105,7 +105,7 @@ def test_an_encoding_of_positions_has_no_parameters_and_tells_all_pixels_apart()
 
 
 def test_unknown_encoding() -> None:
-    with pytest.raises(ConfigError, match=r"^model\.attention_positions: no 'sin'\. Did you mean 'sine'\? Pass one of"):
+    with pytest.raises(ConfigError, match=r"model\.attention_positions: .*'sine'"):
         TransformerBlock(8, positions="sin")
 
 

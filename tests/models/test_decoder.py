@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hudepth.models.decoder import UpBlock, is_usual_head, joint_head, run_head, split_kernel
+from hudepth.models.decoder import Head, UpBlock, split_kernel
 
 
 def identity_block(channels_in: int, channels_skip: int, *, keep: int, upsample: str) -> UpBlock:
@@ -167,22 +166,13 @@ def test_bilinear_up_blocks_stay_plain() -> None:
     assert merged(x, skip).equal(plain(x, skip))
 
 
-@pytest.mark.parametrize("biases", [(True, True), (True, False), (False, True), (False, False)])
 @given(inner=channels, middle=channels, height=sides, width=sides, seed=st.integers(0, 1000))
-def test_a_joint_head_is_both_its_steps(
-    biases: tuple[bool, bool], inner: int, middle: int, height: int, width: int, seed: int
-) -> None:
+def test_a_joint_head_is_both_its_steps(inner: int, middle: int, height: int, width: int, seed: int) -> None:
     torch.manual_seed(seed)
-    up = nn.ConvTranspose2d(inner, middle, 4, stride=2, padding=1, bias=biases[0]).double()
-    head = nn.Conv2d(middle, 1, 3, padding=1, bias=biases[1]).double()
+    head = Head(inner, width=middle, arithmetic="merged").double()
+    assert [part.shape for part in head.joint()] == [(4, inner, 3, 3), (4,)]
     x = leaf(2, inner, height, width)
-
-    def merged() -> Tensor:
-        joint = joint_head(up.weight, up.bias, head.weight, head.bias)
-        assert [part.shape for part in joint] == [(4, inner, 3, 3), (4,)]
-        return run_head(up, head, x, joint=joint)
-
-    assert_same(lambda: head(up(x)), merged, [x, *up.parameters(), *head.parameters()])
+    assert_same(lambda: head.steps(x), lambda: head(x), [x, *head.parameters()])
 
 
 @given(inner=channels, middle=channels, height=st.integers(2, 5), width=st.integers(2, 5), seed=st.integers(0, 1000))
@@ -191,33 +181,15 @@ def test_the_joint_convolution_alone_is_right_inside(
 ) -> None:
     """And wrong on the outermost pixels, which is why the border takes the two steps."""
     torch.manual_seed(seed)
-    up, head = nn.ConvTranspose2d(inner, middle, 4, stride=2, padding=1).double(), nn.Conv2d(middle, 1, 3, padding=1)
-    head = head.double()
+    head = Head(inner, width=middle).double()
     x = leaf(2, inner, height, width)
-    assert up.bias is not None
-    assert head.bias is not None
-    joint = joint_head(up.weight, up.bias, head.weight, head.bias)
+    joint = head.joint()
     inside = functional.pixel_shuffle(functional.conv2d(x, *joint, padding=1), 2)
-    expected = head(up(x))
+    expected = head(x)
     torch.testing.assert_close(inside[..., 1:-1, 1:-1], expected[..., 1:-1, 1:-1], rtol=1e-10, atol=1e-12)
     assert (inside - expected)[..., 0, :].abs().max() > 1e-9
 
 
-@pytest.mark.parametrize(
-    ("up", "head", "usual"),
-    [
-        ({}, {}, True),
-        ({"bias": False}, {"bias": False}, True),
-        ({"kernel_size": 2, "padding": 0}, {}, False),
-        ({"stride": 1}, {}, False),
-        ({}, {"kernel_size": 1, "padding": 0}, False),
-        ({}, {"padding": 0}, False),
-        ({}, {"out_channels": 64}, False),
-    ],
-)
-def test_which_heads_can_be_joined(up: dict[str, Any], head: dict[str, Any], usual: bool) -> None:
-    first = nn.ConvTranspose2d(
-        **{"in_channels": 4, "out_channels": 2, "kernel_size": 4, "stride": 2, "padding": 1, **up}
-    )
-    second = nn.Conv2d(**{"in_channels": 2, "out_channels": 1, "kernel_size": 3, "padding": 1, **head})
-    assert is_usual_head(first, second) == usual
+def test_a_head_of_several_channels_stays_plain() -> None:
+    assert Head(4, arithmetic="merged").merged
+    assert not Head(4, 64, arithmetic="merged").merged

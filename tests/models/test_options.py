@@ -94,6 +94,5 @@ def test_every_output_takes_what_it_asks_for() -> None:
 def test_choosing() -> None:
     choices = {"one": 1, "two": 2}
     assert choose("model.x", "two", choices) == 2
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=r"model\.x: 'tow' .*one, two.* 'two'"):
         choose("model.x", "tow", choices)
-    assert str(caught.value) == "model.x: no 'tow'. Did you mean 'two'? Pass one of one, two."

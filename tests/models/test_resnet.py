@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hudepth.base.errors import CheckpointError
-from hudepth.models.resnet import IMAGENET_URL, BasicBlock, ResNet18Trunk
+from hudepth.models.resnet import IMAGENET_URL, BasicBlock, ResNet18Encoder
 
-RESNET = "Pass a ResNet-18 file with torchvision's parameter names"
+RESNET = "Pass a ResNet-18 state_dict with torchvision's parameter names"
 
 
 @pytest.fixture
-def trunk_file() -> Path:
+def encoder_file() -> Path:
     """File of ImageNet weights of conv1 to layer3."""
     default = Path(__file__).parents[2] / "../shared/data/resnet18/resnet18_imagenet_conv1_to_layer3.pth"
     path = Path(os.environ.get("HUDEPTH_RESNET18", default)).resolve()
@@ -31,7 +31,7 @@ def trunk_file() -> Path:
 @pytest.fixture
 def state() -> dict[str, Tensor]:
     torch.manual_seed(1)
-    return ResNet18Trunk().state_dict()
+    return ResNet18Encoder().state_dict()
 
 
 def saved(tmp_path: Path, content: Any) -> str:
@@ -76,32 +76,32 @@ def test_basic_block(channels_in: int, channels_out: int, stride: int) -> None:
     assert torch.equal(x, before)
 
 
-def test_trunk_is_resnet18_to_layer3() -> None:
+def test_encoder_is_resnet18_to_layer3() -> None:
     torch.manual_seed(0)
-    trunk = ResNet18Trunk().eval()
-    randomise(trunk)
+    encoder = ResNet18Encoder().eval()
+    randomise(encoder)
     image = torch.randn(1, 3, 64, 48)
-    features = trunk(image)
-    x = norm(functional.conv2d(image, trunk.conv1.weight, stride=2, padding=3), trunk.bn1).clamp(min=0)
-    torch.testing.assert_close(features.stem, x, rtol=1e-4, atol=1e-4)
+    features = encoder(image)
+    x = norm(functional.conv2d(image, encoder.conv1.weight, stride=2, padding=3), encoder.bn1).clamp(min=0)
+    torch.testing.assert_close(features[0], x, rtol=1e-4, atol=1e-4)
     x = functional.max_pool2d(x, 3, stride=2, padding=1)
-    for name, stride in (("layer1", 1), ("layer2", 2), ("layer3", 2)):
-        for i, block in enumerate(getattr(trunk, name)):
+    for number, (name, stride) in enumerate((("layer1", 1), ("layer2", 2), ("layer3", 2)), start=1):
+        for i, block in enumerate(getattr(encoder, name)):
             x = block_oracle(block, x, stride=stride if i == 0 else 1)
-        torch.testing.assert_close(getattr(features, name), x, rtol=1e-3, atol=1e-3 * x.abs().max().item())
+        torch.testing.assert_close(features[number], x, rtol=1e-3, atol=1e-3 * x.abs().max().item())
 
 
-def test_real_weights_load_exactly(trunk_file: Path) -> None:
-    theirs = torch.load(trunk_file, weights_only=True)
-    ours = ResNet18Trunk(weights=str(trunk_file)).state_dict()
+def test_real_weights_load_exactly(encoder_file: Path) -> None:
+    theirs = torch.load(encoder_file, weights_only=True)
+    ours = ResNet18Encoder.from_pretrained(str(encoder_file)).state_dict()
     assert theirs.keys() <= ours.keys()
     assert sum(not torch.equal(ours[name], value) for name, value in theirs.items()) == 0
     assert sum(value.numel() for name, value in ours.items() if value.is_floating_point()) > 2_780_000
 
 
-def test_parts_of_a_full_file_that_the_trunk_lacks_are_ignored(tmp_path: Path, state: dict[str, Tensor]) -> None:
+def test_parts_of_a_full_file_that_the_encoder_lacks_are_ignored(tmp_path: Path, state: dict[str, Tensor]) -> None:
     full = {**state, "layer4.0.conv1.weight": torch.zeros(2), "fc.weight": torch.zeros(3), "fc.bias": torch.zeros(1)}
-    loaded = ResNet18Trunk(weights=saved(tmp_path, full)).state_dict()
+    loaded = ResNet18Encoder.from_pretrained(saved(tmp_path, full)).state_dict()
     assert loaded.keys() == state.keys()
     assert all(torch.equal(loaded[name], state[name]) for name in state)
 
@@ -109,8 +109,8 @@ def test_parts_of_a_full_file_that_the_trunk_lacks_are_ignored(tmp_path: Path, s
 @pytest.mark.parametrize("weights", [None, "none"])
 def test_no_weights_are_random(weights: str | None) -> None:
     torch.manual_seed(0)
-    one = ResNet18Trunk(weights=weights)
-    other = ResNet18Trunk(weights=weights)
+    one = ResNet18Encoder.from_pretrained(weights)
+    other = ResNet18Encoder.from_pretrained(weights)
     assert not torch.equal(one.conv1.weight, other.conv1.weight)
     # He initialisation by fan-out: 64 x 7 x 7 outputs of each input value
     assert one.conv1.weight.std().item() == pytest.approx((2 / (64 * 49)) ** 0.5, rel=0.05)
@@ -119,7 +119,7 @@ def test_no_weights_are_random(weights: str | None) -> None:
 def test_missing_tensors(tmp_path: Path, state: dict[str, Tensor]) -> None:
     path = saved(tmp_path, {name: value for name, value in state.items() if not name.startswith("layer3.1.")})
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights=path)
+        ResNet18Encoder.from_pretrained(path)
     assert str(caught.value) == (
         f"model.weights: '{path}' does not fit: 12 tensors missing, the first is 'layer3.1.bn1.bias'. {RESNET}, "
         "or model.weights=none."
@@ -129,17 +129,17 @@ def test_missing_tensors(tmp_path: Path, state: dict[str, Tensor]) -> None:
 def test_unknown_tensors(tmp_path: Path, state: dict[str, Tensor]) -> None:
     path = saved(tmp_path, {**state, "layer3.2.conv1.weight": torch.zeros(1)})
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights=path)
+        ResNet18Encoder.from_pretrained(path)
     assert str(caught.value) == (
         f"model.weights: '{path}' does not fit: 1 tensors unknown, the first is 'layer3.2.conv1.weight'. {RESNET}, "
         "or model.weights=none."
     )
 
 
-def test_misshapen_tensors_leave_the_trunk_as_it_was(tmp_path: Path, state: dict[str, Tensor]) -> None:
+def test_misshapen_tensors_leave_the_encoder_as_it_was(tmp_path: Path, state: dict[str, Tensor]) -> None:
     path = saved(tmp_path, {**state, "conv1.weight": torch.zeros(64, 1, 7, 7)})
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights=path)
+        ResNet18Encoder.from_pretrained(path)
     assert str(caught.value) == (
         f"model.weights: '{path}' does not fit: 1 tensors of another shape, the first is 'conv1.weight'. {RESNET}, "
         "or model.weights=none."
@@ -148,7 +148,7 @@ def test_misshapen_tensors_leave_the_trunk_as_it_was(tmp_path: Path, state: dict
 
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights=str(tmp_path / "x.pth"))
+        ResNet18Encoder.from_pretrained(str(tmp_path / "x.pth"))
     assert str(caught.value) == (
         f"model.weights: no file '{tmp_path / 'x.pth'}'. Pass imagenet, none, or the path of a ResNet-18 file."
     )
@@ -156,7 +156,7 @@ def test_no_file(tmp_path: Path) -> None:
 
 def test_misspelt_name() -> None:
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights="imagnet")
+        ResNet18Encoder.from_pretrained("imagnet")
     assert str(caught.value) == (
         "model.weights: no file 'imagnet'. Did you mean 'imagenet'? "
         "Pass imagenet, none, or the path of a ResNet-18 file."
@@ -175,7 +175,7 @@ def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
     marker = tmp_path / "ran"
     path = saved(tmp_path, {"conv1.weight": Evil(marker)})
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights=path)
+        ResNet18Encoder.from_pretrained(path)
     assert str(caught.value) == (
         f"model.weights: '{path}' is not a file of plain tensors (UnpicklingError). "
         "Pass a ResNet-18 state_dict with torchvision's parameter names, or model.weights=none."
@@ -189,15 +189,17 @@ def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
 def test_file_without_a_state_dict(tmp_path: Path, content: object) -> None:
     path = saved(tmp_path, content)
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights=path)
-    assert str(caught.value) == f"model.weights: '{path}' holds no state_dict. {RESNET}."
+        ResNet18Encoder.from_pretrained(path)
+    assert (
+        str(caught.value) == f"model.weights: '{path}' does not contain a state_dict. {RESNET}, or model.weights=none."
+    )
 
 
 def test_damaged_file(tmp_path: Path) -> None:
     path = tmp_path / "x.pth"
     path.write_bytes(pickle.dumps({"a": 1}, protocol=2)[:5])
     with pytest.raises(CheckpointError, match="is not a file of plain tensors"):
-        ResNet18Trunk(weights=str(path))
+        ResNet18Encoder.from_pretrained(str(path))
 
 
 def offline(*args: Any, **kwargs: Any) -> Any:
@@ -209,7 +211,7 @@ def test_imagenet_without_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", offline)
     before = socket.getdefaulttimeout()
     with pytest.raises(CheckpointError) as caught:
-        ResNet18Trunk(weights="imagenet")
+        ResNet18Encoder.from_pretrained("imagenet")
     assert str(caught.value) == (
         f"model.weights=imagenet: could not download {IMAGENET_URL} (<urlopen error no route to host>). "
         "Pass model.weights=<path to resnet18-f37072fd.pth>, or model.weights=none to train from scratch."
@@ -225,6 +227,6 @@ def test_imagenet_is_checked_by_its_hash(monkeypatch: pytest.MonkeyPatch, state:
         return {**state, "fc.weight": torch.zeros(1000, 512)}
 
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", download)
-    trunk = ResNet18Trunk(weights="imagenet")
-    assert torch.equal(trunk.conv1.weight, state["conv1.weight"])
+    encoder = ResNet18Encoder.from_pretrained("imagenet")
+    assert torch.equal(encoder.conv1.weight, state["conv1.weight"])
     assert asked == {"url": IMAGENET_URL, "map_location": "cpu", "check_hash": True, "weights_only": True}

@@ -15,7 +15,7 @@ from hudepth.base import verbs
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.instantiate import instantiate
 from hudepth.models import ResNet18UNet
-from hudepth.models.resnet import ResNet18Trunk
+from hudepth.models.resnet import ResNet18Encoder
 from hudepth.runs.checkpoint import KEY, VERSION, load_checkpoint
 
 CONFIGS = {"resnet18_unet": 0, "hybrid_unet_text": 4}
@@ -49,19 +49,19 @@ def transformer(channels: int) -> int:
 
 # Module, output of a 224 x 224 image without the batch, parameters.
 TABLE = [
-    ("trunk.conv1", (64, 112, 112), conv(3, 64, 7)),
-    ("trunk.bn1", (64, 112, 112), norm(64)),
-    ("trunk.layer1", (64, 56, 56), basic_blocks(64, 64)),
-    ("trunk.layer2", (128, 28, 28), basic_blocks(64, 128)),
-    ("trunk.layer3", (256, 14, 14), basic_blocks(128, 256)),
-    ("trunk.layer4", (512, 7, 7), basic_blocks(256, 512)),
+    ("encoder.conv1", (64, 112, 112), conv(3, 64, 7)),
+    ("encoder.bn1", (64, 112, 112), norm(64)),
+    ("encoder.layer1", (64, 56, 56), basic_blocks(64, 64)),
+    ("encoder.layer2", (128, 28, 28), basic_blocks(64, 128)),
+    ("encoder.layer3", (256, 14, 14), basic_blocks(128, 256)),
+    ("encoder.layer4", (512, 7, 7), basic_blocks(256, 512)),
     ("attention", (512, 7, 7), 4 * transformer(512)),
     ("up1", (256, 14, 14), up_block(512, 256, 256)),
     ("up2", (128, 28, 28), up_block(256, 128, 128)),
     ("up3", (64, 56, 56), up_block(128, 64, 64)),
     ("up4", (64, 112, 112), up_block(64, 64, 64)),
-    ("head_up", (32, 224, 224), conv(64, 32, 4, bias=True)),
-    ("head", (1, 224, 224), conv(32, 1, 3, bias=True)),
+    ("head.up", (32, 224, 224), conv(64, 32, 4, bias=True)),
+    ("head.conv", (1, 224, 224), conv(32, 1, 3, bias=True)),
 ]
 RESNET18 = 11_176_512
 """Parameters of torchvision's resnet18 (11,689,512) without those of fc (512 x 1000 + 1000)."""
@@ -106,7 +106,7 @@ def test_the_rows_are_all_there_is(net: ResNet18UNet) -> None:
     total = sum(row[2] for row in TABLE)
     assert count(net) == total == 27_029_377
     assert all(parameter.requires_grad for parameter in net.parameters())
-    assert sum(row[2] for row in TABLE if row[0].startswith("trunk")) == count(net.trunk) == RESNET18
+    assert sum(row[2] for row in TABLE if row[0].startswith("encoder")) == count(net.encoder) == RESNET18
 
 
 @pytest.mark.parametrize(("name", "layers"), CONFIGS.items())
@@ -119,7 +119,7 @@ def test_configured_networks(name: str, layers: int) -> None:
     assert len(built.attention) == layers
 
 
-def test_the_trunk_names_its_parts_as_torchvision_does() -> None:
+def test_the_encoder_names_its_parts_as_torchvision_does() -> None:
     """From torchvision's code: conv1, bn1, four layers of two blocks, a shortcut where a layer changes the width."""
     norms = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
     expected = {"conv1.weight", *(f"bn1.{n}" for n in norms)}
@@ -129,41 +129,42 @@ def test_the_trunk_names_its_parts_as_torchvision_does() -> None:
             expected |= {f"{at}.conv{i}.weight" for i in (1, 2)} | {f"{at}.bn{i}.{n}" for i in (1, 2) for n in norms}
             if layer > 1 and block == 0:
                 expected |= {f"{at}.downsample.0.weight", *(f"{at}.downsample.1.{n}" for n in norms)}
-    assert set(ResNet18Trunk(layers=4).state_dict()) == expected
+    assert set(ResNet18Encoder(layers=4).state_dict()) == expected
 
 
 def test_layer4_changes_nothing_before_it() -> None:
     torch.manual_seed(0)
-    short = ResNet18Trunk().eval()
-    long = ResNet18Trunk(layers=4).eval()
+    short = ResNet18Encoder().eval()
+    long = ResNet18Encoder(layers=4).eval()
     long.load_state_dict(short.state_dict(), strict=False)
     image = torch.randn(1, 3, 64, 96)
     three, four = short(image), long(image)
-    assert three.layer4 is None
+    assert len(three) == 4
     assert all(torch.equal(a, b) for a, b in zip(three[:4], four[:4], strict=True))
     assert long.layer4 is not None
-    assert torch.equal(four.layer4, long.layer4(four.layer3))
+    assert torch.equal(four[4], long.layer4(four[3]))
 
 
 def test_the_parts_are_joined_as_a_unet(net: ResNet18UNet) -> None:
     net.eval()
-    trunk, image = net.trunk, torch.randn(1, 3, 64, 96)
-    skip0 = trunk.relu(trunk.bn1(trunk.conv1(image)))
-    skip1 = trunk.layer1(trunk.maxpool(skip0))
-    skip2 = trunk.layer2(skip1)
-    skip3 = trunk.layer3(skip2)
-    assert trunk.layer4 is not None
-    x = trunk.layer4(skip3)
+    encoder, image = net.encoder, torch.randn(1, 3, 64, 96)
+    skip0 = encoder.relu(encoder.bn1(encoder.conv1(image)))
+    skip1 = encoder.layer1(encoder.maxpool(skip0))
+    skip2 = encoder.layer2(skip1)
+    skip3 = encoder.layer3(skip2)
+    assert encoder.layer4 is not None
+    x = encoder.layer4(skip3)
     for block in net.attention:
         x = block(x)
     x = net.up4(net.up3(net.up2(net.up1(x, skip3), skip2), skip1), skip0)
-    assert torch.equal(net(image), torch.sigmoid(net.head(net.head_up(x))))
+    assert torch.equal(net(image), torch.sigmoid(net.head.conv(net.head.up(x))))
     assert all(part.std() > 0.1 for part in (skip0, skip1, skip2, skip3))  # so that a part that is left out shows
 
 
 SMALL = ResNet18UNet().eval()
 
 
+@pytest.mark.slow
 @given(rows=st.integers(1, 4), columns=st.integers(1, 4), batch=st.integers(1, 2))
 def test_any_size_that_is_a_multiple_of_32(rows: int, columns: int, batch: int) -> None:
     with torch.inference_mode():
@@ -189,34 +190,21 @@ def test_any_other_size_is_told_the_nearest(height: int, width: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "words"),
     [
-        ({"attention_layers": -1}, "model.attention_layers: -1 is less than 0. Pass 4, or 0 for none."),
-        (
-            {"attention_layers": 1, "attention_heads": 7},
-            "model.attention_heads: 7 heads do not divide 512 channels. Pass one of [1, 2, 4, 8, 16, 32, 64].",
-        ),
-        (
-            {"attention_layers": 1, "attention_activation": "rely"},
-            "model.attention_activation: no 'rely'. Did you mean 'relu'? Pass one of relu, gelu, silu.",
-        ),
-        (
-            {"attention_layers": 1, "attention_positions": "sin"},
-            "model.attention_positions: no 'sin'. Did you mean 'sine'? Pass one of none, sine.",
-        ),
-        (
-            {"output": "sigmoyd"},
-            "model.output: no 'sigmoyd'. Did you mean 'sigmoid'? "
-            "Pass one of sigmoid, relu, softplus, identity, log, bins.",
-        ),
+        ({"attention_layers": -1}, r"model\.attention_layers: -1 "),
+        ({"attention_layers": 1, "attention_heads": 7}, r"model\.attention_heads: 7 "),
+        ({"attention_layers": 1, "attention_activation": "rely"}, r"model\.attention_activation: .*'relu'"),
+        ({"attention_layers": 1, "attention_positions": "sin"}, r"model\.attention_positions: .*'sine'"),
+        ({"output": "sigmoyd"}, r"model\.output: .*'sigmoid'"),
     ],
 )
-def test_unknown_option(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+def test_unknown_option(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
         ResNet18UNet(**options)
-    assert str(caught.value) == message
 
 
+@pytest.mark.slow
 def test_options_change_the_output() -> None:
     image, outputs = torch.randn(1, 3, 64, 64), []
     for options in (
@@ -228,11 +216,12 @@ def test_options_change_the_output() -> None:
     assert all(not torch.equal(a, b) for i, a in enumerate(outputs) for b in outputs[:i])
 
 
+@pytest.mark.slow
 def test_without_attention_far_corners_are_out_of_reach() -> None:
     """What the transformer layers add: each pixel sees the whole image."""
     for layers, seen in ((0, False), (1, True)):
         net = ResNet18UNet(attention_layers=layers).eval().double()
-        image = torch.randn(1, 3, 1024, 32, dtype=torch.float64, requires_grad=True)
+        image = torch.randn(1, 3, 576, 32, dtype=torch.float64, requires_grad=True)
         net(image)[..., 0, 0].sum().backward()
         assert image.grad is not None
         assert bool(image.grad[..., :32, :].any())
@@ -249,7 +238,7 @@ def test_gradient_reaches_every_parameter(net: ResNet18UNet) -> None:
 @pytest.fixture
 def state() -> dict[str, Tensor]:
     torch.manual_seed(1)
-    return ResNet18Trunk(layers=4).state_dict()
+    return ResNet18Encoder(layers=4).state_dict()
 
 
 def saved(tmp_path: Path, content: Any) -> str:
@@ -259,7 +248,7 @@ def saved(tmp_path: Path, content: Any) -> str:
 
 def test_a_full_file_loads_whole(tmp_path: Path, state: dict[str, Tensor], caplog: pytest.LogCaptureFixture) -> None:
     full = {**state, "fc.weight": torch.zeros(1000, 512), "fc.bias": torch.zeros(1000)}
-    loaded = ResNet18UNet(weights=saved(tmp_path, full)).trunk.state_dict()
+    loaded = ResNet18UNet(weights=saved(tmp_path, full)).encoder.state_dict()
     assert loaded.keys() == state.keys()
     assert all(torch.equal(loaded[name], state[name]) for name in state)
     assert not caplog.records
@@ -271,11 +260,11 @@ def test_a_file_without_layer4_loads_the_rest_and_says_so(
     short = {name: value for name, value in state.items() if not name.startswith("layer4.")}
     path = saved(tmp_path, short)
     with caplog.at_level(logging.INFO, logger="hudepth"):
-        trunk = ResNet18UNet(weights=path).trunk
+        encoder = ResNet18UNet(weights=path).encoder
     assert [(r.levelname, r.getMessage()) for r in caplog.records] == [
         ("WARNING", f"model.weights: '{path}' has no layer4, which starts at random")
     ]
-    loaded = trunk.state_dict()
+    loaded = encoder.state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in short.items())
     # He initialisation by fan-out: 512 x 3 x 3 outputs of each input value
     assert loaded["layer4.1.conv2.weight"].std().item() == pytest.approx((2 / (512 * 9)) ** 0.5, rel=0.05)
@@ -283,14 +272,11 @@ def test_a_file_without_layer4_loads_the_rest_and_says_so(
 
 def test_half_a_layer4_is_a_mistake(tmp_path: Path, state: dict[str, Tensor]) -> None:
     path = saved(tmp_path, {name: value for name, value in state.items() if not name.startswith("layer4.1.")})
-    with pytest.raises(CheckpointError) as caught:
+    with pytest.raises(CheckpointError, match=r"model\.weights: .* 12 tensors missing.*'layer4\.1\.bn1\.bias'"):
         ResNet18UNet(weights=path)
-    assert str(caught.value) == (
-        f"model.weights: '{path}' does not fit: 12 tensors missing, the first is 'layer4.1.bn1.bias'. "
-        "Pass a ResNet-18 file with torchvision's parameter names, or model.weights=none."
-    )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_checkpoint_gives_the_network_back(name: str, tmp_path: Path) -> None:
     """Without trust, so that it is laid out without memory first."""

@@ -76,7 +76,7 @@ def test_what_may_change_when_a_run_is_resumed(key: str, may: bool) -> None:
     [
         ("schedule.T_max", 3, "schedule"), ("schedule._target_", "hudepth.training.schedules.WarmupCosine", "schedule"),
         ("data.progressive", [{"size": [8, 8], "until": 0.5}], "progressive"),
-        ("callbacks.extra", [{"_target_": "hudepth.training.freezing.FreezeTrunk"}], "Freeze"), ("seed", 2, ""),
+        ("callbacks.extra", [{"_target_": "hudepth.training.freezing.FreezeEncoder"}], "Freeze"), ("seed", 2, ""),
     ],
 )  # fmt: skip
 def test_the_part_that_depends_on_the_length_is_named(key: str, value: Any, part: str) -> None:

@@ -19,12 +19,12 @@ from hudepth.training.optim import GroupedAdamW
 
 
 class Net(nn.Module):
-    """A kernel, a bias and a norm in the trunk and beside it."""
+    """A kernel, a bias and a norm in the encoder and outside it."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.trunk = nn.Sequential(nn.Conv2d(2, 3, 3), nn.BatchNorm2d(3))
-        self.trunks = nn.Linear(2, 2, bias=False)  # whose name only begins like the trunk's
+        self.encoder = nn.Sequential(nn.Conv2d(2, 3, 3), nn.BatchNorm2d(3))
+        self.encoders = nn.Linear(2, 2, bias=False)  # whose name only begins like the encoder's
         self.head = nn.Conv2d(3, 1, 1)
 
 
@@ -34,18 +34,20 @@ def groups(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Any]]:
 
 def test_groups_by_part_and_by_decay() -> None:
     net = Net()
-    found = groups(GroupedAdamW(net.named_parameters(), lr=1e-3, trunk_lr_factor=0.3, weight_decay=0.05))
+    found = groups(
+        GroupedAdamW(net.named_parameters(), encoder=net.encoder, lr=1e-3, encoder_lr_factor=0.3, weight_decay=0.05)
+    )
     names = {name: group["param_names"] for name, group in found.items()}
     assert names == {
-        "trunk": ["trunk.0.weight"],
-        "trunk_no_decay": ["trunk.0.bias", "trunk.1.weight", "trunk.1.bias"],
-        "rest": ["trunks.weight", "head.weight"],
+        "encoder": ["encoder.0.weight"],
+        "encoder_no_decay": ["encoder.0.bias", "encoder.1.weight", "encoder.1.bias"],
+        "rest": ["encoders.weight", "head.weight"],
         "rest_no_decay": ["head.bias"],
     }
     rates = {name: (group["lr"], group["weight_decay"]) for name, group in found.items()}
     assert rates == {
-        "trunk": (pytest.approx(3e-4), 0.05),
-        "trunk_no_decay": (pytest.approx(3e-4), 0.0),
+        "encoder": (pytest.approx(3e-4), 0.05),
+        "encoder_no_decay": (pytest.approx(3e-4), 0.0),
         "rest": (1e-3, 0.05),
         "rest_no_decay": (1e-3, 0.0),
     }
@@ -53,14 +55,14 @@ def test_groups_by_part_and_by_decay() -> None:
 
 def test_every_parameter_of_the_hybrid_unet_is_in_one_group() -> None:
     net = HybridUNet()
-    found = groups(GroupedAdamW(net.named_parameters(), lr=1e-3))
+    found = groups(GroupedAdamW(net.named_parameters(), encoder=net.encoder, lr=1e-3))
     members = [id(parameter) for group in found.values() for parameter in group["params"]]
     assert len(members) == len(set(members))
     assert set(members) == {id(parameter) for parameter in net.parameters()}
-    inside = {id(parameter) for parameter in net.trunk.parameters()}
+    inside = {id(parameter) for parameter in net.encoder.parameters()}
     for name, group in found.items():
         for parameter in group["params"]:
-            assert (id(parameter) in inside) == name.startswith("trunk")
+            assert (id(parameter) in inside) == name.startswith("encoder")
             assert (parameter.ndim == 1) == name.endswith("_no_decay")
 
 
@@ -87,7 +89,12 @@ def test_steps_are_those_of_adamw(factor: float, decay: float, beta1: float, see
     torch.manual_seed(seed)
     net, lr = Net().double(), 0.01
     optimizer = GroupedAdamW(
-        net.named_parameters(), lr=lr, trunk_lr_factor=factor, weight_decay=decay, betas=(beta1, 0.95)
+        net.named_parameters(),
+        encoder=net.encoder,
+        lr=lr,
+        encoder_lr_factor=factor,
+        weight_decay=decay,
+        betas=(beta1, 0.95),
     )
     before = {name: parameter.detach().numpy().copy() for name, parameter in net.named_parameters()}
     gradients: list[dict[str, Tensor]] = []
@@ -100,7 +107,7 @@ def test_steps_are_those_of_adamw(factor: float, decay: float, beta1: float, see
         expected = adamw(
             before[name],
             [each[name].numpy() for each in gradients],
-            lr=lr * (factor if name.startswith("trunk.") else 1),
+            lr=lr * (factor if name.startswith("encoder.") else 1),
             decay=decay if parameter.ndim > 1 else 0,
             beta1=beta1,
             beta2=0.95,
@@ -108,31 +115,33 @@ def test_steps_are_those_of_adamw(factor: float, decay: float, beta1: float, see
         np.testing.assert_allclose(parameter.detach(), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_a_factor_of_0_keeps_the_trunk_as_it_is() -> None:
+def test_a_factor_of_0_keeps_the_encoder_as_it_is() -> None:
     net = Net()
     before = {name: parameter.detach().clone() for name, parameter in net.named_parameters()}
-    optimizer = GroupedAdamW(net.named_parameters(), lr=0.1, trunk_lr_factor=0.0, weight_decay=0.5)
+    optimizer = GroupedAdamW(
+        net.named_parameters(), encoder=net.encoder, lr=0.1, encoder_lr_factor=0.0, weight_decay=0.5
+    )
     for parameter in net.parameters():
         parameter.grad = torch.ones_like(parameter)
     optimizer.step()
     for name, parameter in net.named_parameters():
-        assert parameter.equal(before[name]) == name.startswith("trunk.")
+        assert parameter.equal(before[name]) == name.startswith("encoder.")
 
 
 def test_its_state_goes_into_a_checkpoint_and_back() -> None:
     net = Net()
-    optimizer = GroupedAdamW(net.named_parameters(), lr=0.1, trunk_lr_factor=0.5)
+    optimizer = GroupedAdamW(net.named_parameters(), encoder=net.encoder, lr=0.1, encoder_lr_factor=0.5)
     for parameter in net.parameters():
         parameter.grad = torch.ones_like(parameter)
     optimizer.step()
-    again = GroupedAdamW(net.named_parameters(), lr=0.2)
+    again = GroupedAdamW(net.named_parameters(), encoder=net.encoder, lr=0.2)
     again.load_state_dict(optimizer.state_dict())
-    assert groups(again)["trunk"]["lr"] == pytest.approx(0.05)
+    assert groups(again)["encoder"]["lr"] == pytest.approx(0.05)
     assert again.state[net.head.weight]["exp_avg"].equal(optimizer.state[net.head.weight]["exp_avg"])
 
 
 @pytest.mark.parametrize("factor", [-0.1, math.nan, math.inf])
 def test_a_factor_that_is_none(factor: float) -> None:
     with pytest.raises(ConfigError) as caught:
-        GroupedAdamW(Net().named_parameters(), lr=1e-3, trunk_lr_factor=factor)
-    assert str(caught.value) == f"optim.trunk_lr_factor: {factor} is not a number of at least 0."
+        GroupedAdamW(Net().named_parameters(), lr=1e-3, encoder_lr_factor=factor)
+    assert str(caught.value).startswith(f"optim.encoder_lr_factor: {factor} ")

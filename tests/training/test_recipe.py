@@ -81,7 +81,7 @@ def test_a_progressive_resolution_that_cannot_be(progressive: str, message: str,
     [
         ("schedule=warmup_cosine", "the learning-rate schedule"),
         ("data.progressive=[{size:[16,32],until:0.5}]", "the progressive resolution"),
-        ("callbacks.extra=[{_target_:hudepth.training.freezing.FreezeTrunk,until:0.5}]", "FreezeTrunk"),
+        ("callbacks.extra=[{_target_:hudepth.training.freezing.FreezeEncoder,until:0.5}]", "FreezeEncoder"),
     ],
 )
 def test_what_is_laid_out_over_the_epochs_keeps_their_number(

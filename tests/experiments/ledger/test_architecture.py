@@ -38,7 +38,7 @@ def test_a_row_that_differs_is_found() -> None:
     table[3] = replace(table[3], parameters=9_409)
     table[-1] = replace(table[-1], shape=(8, 1, 112, 112))
     wrong = [c.row.module for c in compare_with_table_a1(meta_network(), table=table) if not c.matches]
-    assert wrong == ["trunk.conv1", "head"]
+    assert wrong == ["encoder.conv1", "head.conv"]
 
 
 def test_a_network_of_another_make_does_not_agree() -> None:
@@ -56,9 +56,9 @@ def test_variants_of_the_text_by_hand() -> None:
     def transformer(c: int) -> int:
         return (4 * c * c + 4 * c) + (8 * c * c + 5 * c) + 4 * c  # attention, feed-forward, two layer norms
 
-    trunk = 9_408 + 128 + 2 * 73_984 + 230_144 + 295_424 + 919_040 + 1_180_672
+    encoder = 9_408 + 128 + 2 * 73_984 + 230_144 + 295_424 + 919_040 + 1_180_672
     assert variants_of_text() == {
-        "trunk to 7 x 7": trunk + layer4,
+        "encoder to 7 x 7": encoder + layer4,
         "four transformer layers on it": 4 * transformer(512),
         "four layers on 14 x 14": 4_653_313 - transformer(128) + 3 * transformer(256),
     }

@@ -1,0 +1,73 @@
+"""The interface of image encoders: stages with channels and strides, and a pretrained start.
+
+Networks, optimisers and callbacks use it, so that an encoder of your own needs no changes elsewhere.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class Stage(NamedTuple):
+    """A stage of an encoder, which returns one feature map."""
+
+    name: str
+    channels: int
+    stride: int
+    """Pixels of the image per position of the map, along each side."""
+    modules: tuple[str, ...]
+    """The attributes of the encoder that hold the stage's layers."""
+
+
+def run_stage(module: nn.Module, *inputs: Tensor) -> Any:
+    """Return ``module(*inputs)``."""
+    return module(*inputs)
+
+
+class Encoder(nn.Module, ABC):
+    """From a normalised image to one feature map per stage."""
+
+    stages: tuple[Stage, ...]
+    """Finest first."""
+
+    @classmethod
+    @abstractmethod
+    def from_pretrained(cls, weights: str | None, **options: Any) -> Encoder:
+        """Build an encoder and load pretrained weights.
+
+        Args:
+            weights: a name or path that the encoder knows; None or ``none`` for random values.
+            **options: of the encoder.
+
+        Raises:
+            CheckpointError: if the weights are missing or do not fit.
+        """
+
+    @abstractmethod
+    def forward(self, image: Float[Tensor, "b 3 h w"], *, run: Callable[..., Any] = run_stage) -> list[Tensor]:
+        """Return the feature map of each stage, finest first.
+
+        Args:
+            image: RGB, normalised with ImageNet's statistics.
+            run: runs a stage, for example :func:`hudepth.models.recompute.recomputed`.
+        """
+
+    def freeze(self, stages: int, *, frozen: bool = True) -> None:
+        """Stop or resume training the first stages.
+
+        Args:
+            stages: how many.
+            frozen: False to train them again.
+        """
+        for name in (name for stage in self.stages[:stages] for name in stage.modules):
+            getattr(self, name).requires_grad_(requires_grad=not frozen)
+
+
+def find_encoder(net: nn.Module) -> Encoder | None:
+    """Return the encoder within a network, None if it has none."""
+    return next((module for module in net.modules() if isinstance(module, Encoder)), None)

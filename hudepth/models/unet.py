@@ -1,0 +1,107 @@
+"""What the UNets share: an encoder, optional attention on its feature maps, and the decoder of table A1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hudepth.base.errors import ConfigError
+from hudepth.models.decoder import Head, UpBlock
+from hudepth.models.encoder import Encoder, run_stage
+from hudepth.models.options import OUTPUTS, choose
+from hudepth.models.recompute import recomputed
+
+
+class UNet(nn.Module):
+    """One normalised RGB image in, one unit depth map of the same size out.
+
+    The decoder has an up block for each of the encoder's stages but the deepest, as wide as that stage.
+
+    Args:
+        encoder: at least two stages, each of half the size of the one before, the first of half the image's size.
+        upsample: ``nearest`` (figure 4 says UpSampling2D, whose default it is) or ``bilinear``.
+        output: from the last convolution to unit depth, one of :data:`hudepth.models.options.OUTPUTS`.
+        arithmetic: ``plain`` or ``merged``; see :mod:`hudepth.models.decoder`.
+        recompute: in training, recompute each stage's activations for the gradients instead of keeping them.
+        **attention: further modules, by attribute name, for :meth:`attend`.
+
+    Raises:
+        ConfigError: for an unknown option.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        *,
+        upsample: str = "nearest",
+        output: str = "sigmoid",
+        arithmetic: str = "plain",
+        recompute: bool = False,
+        **attention: nn.Module,
+    ) -> None:
+        super().__init__()
+        self.recompute = recompute
+        self.encoder = encoder
+        for name, module in attention.items():
+            self.add_module(name, module)
+        channels = [stage.channels for stage in reversed(encoder.stages)]
+        self._up = [f"up{i}" for i in range(1, len(channels))]
+        for name, (coarse, skip) in zip(self._up, pairwise(channels), strict=True):
+            self.add_module(name, UpBlock(coarse, skip, skip, upsample=upsample, arithmetic=arithmetic))
+        final = choose("model.output", output, OUTPUTS)()
+        self.head = Head(channels[-1], getattr(final, "channels_in", 1), arithmetic=arithmetic)
+        self.output = final
+
+    def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:
+        """Return the encoder's feature maps, finest first, as the decoder takes them.
+
+        Args:
+            features: of the encoder.
+            run: runs a module, as in :meth:`hudepth.models.encoder.Encoder.forward`.
+        """
+        raise NotImplementedError
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Predict unit depth.
+
+        Args:
+            image: RGB, normalised with ImageNet's statistics; both sides multiples of the deepest stage's stride.
+
+        Returns:
+            Depth / max_depth_m, in [0, 1] with the sigmoid output.
+
+        Raises:
+            ConfigError: if a side is not such a multiple; the message gives the nearest sizes that are.
+        """
+        check_size(*image.shape[-2:], stride=self.encoder.stages[-1].stride)
+        run = recomputed if self.recompute and self.training else run_stage
+        *skips, x = self.attend(self.encoder(image, run=run), run)
+        for name, skip in zip(self._up, reversed(skips), strict=True):
+            x = run(getattr(self, name), x, skip)
+        unit_depth: Tensor = self.output(self.head(x))
+        return unit_depth
+
+
+def check_size(height: int, width: int, *, stride: int) -> None:
+    """Check that a network can take images of this size.
+
+    Args:
+        height: of the images [pixels].
+        width: of the images [pixels].
+        stride: pixels of the image per position of the network's deepest map, along each side.
+
+    Raises:
+        ConfigError: if a side is not a positive multiple of ``stride``; the message gives the nearest sizes that are.
+    """
+    if height < stride or width < stride or height % stride or width % stride:
+        below = [max(stride, side // stride * stride) for side in (height, width)]
+        above = [max(stride, -(-side // stride) * stride) for side in (height, width)]
+        nearest = " or ".join(dict.fromkeys(f"[{h},{w}]" for h, w in (below, above)))
+        raise ConfigError(
+            f"data.size: images of {height} x {width} (height x width), but both sides must be multiples of "
+            f"{stride}. Pass data.size={nearest}."
+        )
