@@ -16,8 +16,9 @@ from pathlib import Path
 from publish import copy_run, hide
 
 from hudepth.base.files import write_between
-from hudepth.report.curves import save_curves
+from hudepth.report.curves import draw_curves
 from hudepth.runs.history import read_history
+from hudepth.viz.panels import save_figure
 
 SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")
 
@@ -42,7 +43,8 @@ def main() -> None:
     hide(study, options.hide)
     shutil.copy(run / "test" / "eigen" / "panels.png", study / "panels.png")
     history = read_history(run / "metrics.csv")
-    save_curves(study / "curves.png", history, title=f"{run.parent.name}: total loss and raw terms, unit depth")
+    title = f"{run.parent.name}: total loss and raw terms, unit depth"
+    save_figure(study / "curves.png", draw_curves(history, title=title))
     metrics = json.loads((study / "test" / "eigen" / "metrics.json").read_text())["metrics"]
     for page in (study / "README.md", *options.pages):
         write_between(page, "results", table(metrics))

@@ -92,10 +92,10 @@ def parse(schema: type[T], values: Mapping[str, Any], *, prefix: str = "", stric
     result = {}
     for name, hint in _hints(schema).items():
         default = _default(known[name])
-        if name in values:
-            result[name] = convert(f"{prefix}{name}", values[name], hint, default=default)
-        elif default is MISSING:
+        if default is MISSING and values.get(name) is None and hint is not Any and type(None) not in get_args(hint):
             raise ConfigError(f"{prefix}{name} is not set. Pass {prefix}{name}=<{_describe(hint)}>.")
+        if name in values or default is MISSING:
+            result[name] = convert(f"{prefix}{name}", values.get(name), hint, default=default)
     return schema(**result)
 
 

@@ -81,16 +81,16 @@ class Table:
             table.add_row(*(_rich(_cell(cell)) for cell in row))
         return table
 
-    def show(self, **style: Any) -> None:
-        """Print to standard output."""
-        stdout().print(self.to_rich(**style))
+    def show(self, log_width: int = LOG_WIDTH, **style: Any) -> None:
+        """Print to standard output; ``style`` goes to :meth:`to_rich`."""
+        stdout(log_width).print(self.to_rich(**style))
 
 
-def stdout() -> Console:
-    """Return a console for results: as wide as the terminal, or :data:`LOG_WIDTH` where there is none."""
+def stdout(log_width: int = LOG_WIDTH) -> Console:
+    """Return a console for results: as wide as the terminal, or ``log_width`` where there is none."""
     from rich.console import Console
 
-    return Console() if sys.stdout.isatty() else Console(width=LOG_WIDTH)
+    return Console() if sys.stdout.isatty() else Console(width=log_width)
 
 
 def _cell(cell: str | Cell) -> Cell:

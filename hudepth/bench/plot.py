@@ -11,8 +11,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from hudepth.bench.rows import Row, beside_peers
 from hudepth.bench.tables import figure_text, label
-from hudepth.report.ablation.variants import COLOURS
 from hudepth.viz.panels import save_figure
+from hudepth.viz.style import COLOURS
 
 MARKERS = "osD^v"
 OURS, OTHERS = COLOURS[1], "0.45"

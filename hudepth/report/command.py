@@ -1,45 +1,45 @@
-"""hudepth-report: what runs say, side by side."""
+"""hudepth-report: results of runs side by side, as tables, pictures and a page."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 from omegaconf import DictConfig
 
-from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.base.options import plain
-from hudepth.base.verbs import VERBS
+from hudepth.base.errors import ConfigError
+from hudepth.base.options import convert, parse, plain
 
 
 def report(cfg: DictConfig) -> None:
     """Run the verb ``compare``, ``table``, ``sweep`` or ``figures``.
 
     Args:
-        cfg: what conf/report.yaml and the command line compose to.
+        cfg: conf/report.yaml with the command-line overrides.
 
     Raises:
         HudepthError: with one line for the user.
     """
     config = plain(cfg)
-    if isinstance(config["runs"], str):  # runs=x as well as runs=[x]
-        config["runs"] = [config["runs"]]
-    verb, protocols = config["verb"], [name for name, protocol in (config["protocol"] or {}).items() if protocol]
-    if verb in ("compare", "sweep") and len(protocols) != 1:
-        raise ConfigError(f"protocol: {verb} takes one, not {len(protocols)}. Pass protocol=eigen.")
+    verb = convert("verb", config["verb"], Literal["compare", "table", "sweep", "figures"])
+    protocols = [name for name, protocol in (config["protocol"] or {}).items() if protocol]
+    if verb in ("compare", "sweep"):
+        if len(protocols) != 1:
+            raise ConfigError(f"protocol: {verb} takes one, not {len(protocols)}. Pass protocol=eigen.")
+        config["protocol"] = protocols[0]
+    # each verb's imports are its own: a table needs neither matplotlib nor torch
     if verb == "compare":
-        from hudepth.report.compare import compare
+        from hudepth.report.compare import CompareOptions, compare
 
-        compare({**config, "protocol": protocols[0]})
+        compare(parse(CompareOptions, config))
     elif verb == "sweep":
-        from hudepth.report.ablation.command import sweep_report
+        from hudepth.report.ablation.command import SweepOptions, report_sweep
 
-        sweep_report({**config, "protocol": protocols[0]})
+        report_sweep(parse(SweepOptions, config))
     elif verb == "table":
-        from hudepth.report.table import table
+        from hudepth.report.table import TableOptions, write_table
 
-        table({**config, "protocol": protocols})
-    elif verb == "figures":
-        from hudepth.report.figures import figures
-
-        figures(config)
+        write_table(parse(TableOptions, {**config, "protocols": protocols}))
     else:
-        hint = did_you_mean(str(verb), VERBS["report"])
-        raise ConfigError(f"verb: no '{verb}'.{hint} Use hudepth-report {' or '.join(VERBS['report'])}.")
+        from hudepth.report.figures import FiguresOptions, draw_figures
+
+        draw_figures(parse(FiguresOptions, config))

@@ -2,95 +2,91 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from hudepth.base.console import log
-from hudepth.base.errors import ConfigError, DataError, HudepthError, did_you_mean
+from hudepth.base.errors import DataError, HudepthError, did_you_mean
 from hudepth.base.files import write_json, write_text
-from hudepth.base.options import whole_number
+from hudepth.base.options import Range, output_folder
+from hudepth.base.tables import Cell, Table, stdout
 from hudepth.metrics.bootstrap import LEVEL, REPEATS, SEED, Difference, describe, paired_differences
-from hudepth.metrics.summary import ImageTable, higher_is_better
-from hudepth.report.scatter import save_comparison
+from hudepth.metrics.catalogue import metric_info
+from hudepth.metrics.summary import ImageTable
+from hudepth.report.scatter import draw_comparison
 from hudepth.runs.results import Result, find_result, paired
 from hudepth.runs.run_dir import CHECKPOINTS
-from hudepth.viz.panels import save_panels
+from hudepth.viz.panels import save_figure, save_panels
 
-UNITS = {"mae": "m", "rmse": "m", "sq_rel": "m", "mse": "m²"}
 PER_IMAGE = ("abs_rel", "rmse")
-"""Metrics of compare.csv; its rows are in the order of the first."""
+"""Metrics of compare.csv, which is sorted by the first."""
 SHOWN = 12
-"""Images in the right half of the picture."""
+"""Images in the right half of compare.png."""
+Place = Annotated[Path, "run directory | folder of test results"]
 
 
-def compare(config: dict[str, Any]) -> None:
-    """Compare two results on the same images; print the table, write compare.json, compare.csv and compare.png;
-    and images.png, where checkpoints and data are at hand.
+@dataclass(frozen=True)
+class CompareOptions:
+    """Options of ``hudepth-report compare``; conf/report.yaml explains them."""
 
-    Args:
-        config: ``a`` and ``b`` (run directories, or folders that hold test results), and perhaps ``protocol`` (its
-            name), ``output`` (a folder), ``repeats`` and ``seed`` of the bootstrap; for images.png ``panels`` (how
-            many images), ``paths``, ``data`` and ``trust``.
+    a: Place
+    b: Place
+    protocol: str = "eigen"
+    output: Path | None = None
+    repeats: Annotated[int, Range(100)] = REPEATS
+    seed: Annotated[int, Range(0)] = SEED
+    panels: Annotated[int, Range(0)] = 0
+    paths: Mapping[str, Any] = field(default_factory=dict)
+    data: Mapping[str, Any] = field(default_factory=dict)
+    trust: list[str] = field(default_factory=list)
+
+
+def compare(options: CompareOptions) -> None:
+    """Compare two results on the same images; print the table, write compare.json, compare.csv and compare.png.
+
+    images.png joins them if checkpoints and data are at hand.
 
     Raises:
-        HudepthError: with one line for the user.
+        HudepthError: if the results are missing, or not of the same images, data and protocol.
     """
-    for key in ("a", "b"):
-        if not config.get(key):
-            raise ConfigError(f"{key} is not set. Pass {key}=<run directory | folder of test results>.")
-    protocol = str(config.get("protocol") or "eigen")
-    repeats, seed = (
-        whole_number(config, "repeats", default=REPEATS, least=100),
-        whole_number(config, "seed", default=SEED),
-    )
-    a, b = (find_result(str(config[key]), protocol) for key in ("a", "b"))
+    a, b = (find_result(path, options.protocol) for path in (options.a, options.b))
     tables = paired(a, b)
-    differences = paired_differences(*tables, **a.averaging, repeats=repeats, seed=seed)
+    differences = paired_differences(*tables, **a.averaging, repeats=options.repeats, seed=options.seed)
     differences = {name: each for name, each in differences.items() if name in a.metrics and name in b.metrics}
-    uncertainty = describe(tables[0], repeats=repeats, seed=seed)
-    output = Path(config.get("output") or "compare").expanduser()
-    try:
-        write_json(output / "compare.json", _document(a, b, differences, uncertainty))
-        write_text(output / "compare.csv", _per_image(*tables))
-        _draw(output / "compare.png", a, b, tables)
-    except OSError as error:
-        raise ConfigError(f"output: cannot write '{output}' ({error.strerror}). Pass output=<a folder>.") from error
+    uncertainty = describe(tables[0], repeats=options.repeats, seed=options.seed)
+    output = output_folder(options.output or "compare")
+    write_json(output / "compare.json", _document(a, b, differences, uncertainty))
+    write_text(output / "compare.csv", _per_image(*tables).to_csv())
+    save_figure(output / "compare.png", _draw(a, b, tables))
     print_comparison(a, b, differences, uncertainty)
-    _draw_images(output / "images.png", a, b, config)
+    _draw_images(output / "images.png", a, b, options)
     log.info("table and pictures: %s", output.resolve())
 
 
-def _draw_images(path: Path, a: Result, b: Result, config: dict[str, Any]) -> None:
-    """Draw what both networks see in the images that differ most, if checkpoints and data are at hand."""
+def _draw_images(path: Path, a: Result, b: Result, options: CompareOptions) -> None:
+    """Draw the predictions of the images that differ most, if checkpoints and data are at hand."""
     runs = {name: result.path.parent.parent for name, result in (("a", a), ("b", b))}
-    if not whole_number(config, "panels", default=0) or not all((run / CHECKPOINTS).is_dir() for run in runs.values()):
+    if not options.panels or not all((run / CHECKPOINTS).is_dir() for run in runs.values()):
         return
-    if not all(of_training_data(result) for result in (a, b)):
-        log.warning(
-            "no images.png: tested on other data than that of the training, which is what runs know how to open"
-        )
+    if not (tested_on_training_data(a) and tested_on_training_data(b)):
+        log.warning("no images.png: a run was tested on other data than its own, and only its own can be opened")
         return
-    from hudepth.evaluation.pictures import panels_beside  # torch and lightning, which only this picture needs
+    from hudepth.evaluation.pictures import panels_beside  # imports torch and lightning
 
     try:
-        panels = panels_beside(runs, differing(a, b, config["panels"]), config=config)
+        save_panels(path, panels_beside(runs, differing(a, b, options.panels), config=vars(options)))
     except HudepthError as error:
         log.warning("no images.png: %s", error)
-        return
-    save_panels(path, panels)
 
 
-def of_training_data(result: Result) -> bool:
-    """Tell whether a network was tested on the data it was trained on, which is what its run knows how to open."""
+def tested_on_training_data(result: Result) -> bool:
+    """Tell whether a network was tested on the data set it was trained on, which is the one its run can open."""
     trained_on = result.document.get("checkpoint")
     for key in ("trained_on", "fingerprint"):
         trained_on = trained_on.get(key) if isinstance(trained_on, dict) else None
@@ -98,12 +94,12 @@ def of_training_data(result: Result) -> bool:
 
 
 def verdict(name: str, difference: Difference) -> str:
-    """Say what an interval of b - a shows: ``a better``, ``b better``, ``no difference shown`` or ``undefined``."""
+    """Return what an interval of b - a shows: ``a better``, ``b better``, ``no difference shown`` or ``undefined``."""
     if math.isnan(difference.low) or math.isnan(difference.high):
         return "undefined"
     if difference.low <= 0 <= difference.high:
         return "no difference shown"
-    return "b better" if (difference.low > 0) == higher_is_better(name) else "a better"
+    return "b better" if (difference.low > 0) == metric_info(name).higher_is_better else "a better"
 
 
 def differing(a: Result, b: Result, count: int, *, metric: str = "abs_rel") -> list[str]:
@@ -117,7 +113,7 @@ def differing(a: Result, b: Result, count: int, *, metric: str = "abs_rel") -> l
 
 
 def _by_difference(a: ImageTable, b: ImageTable, *, metric: str) -> list[int]:
-    """Return the rows of two tables, that of the largest difference first; NaN in one of them is the largest."""
+    """Return the rows of two tables, largest difference first; NaN in one of them is the largest."""
     for table in (a, b):
         if metric not in table.values:
             raise DataError(f"no image has a metric '{metric}'.{did_you_mean(metric, table.values)}")
@@ -130,101 +126,73 @@ def _by_difference(a: ImageTable, b: ImageTable, *, metric: str) -> list[int]:
 
 
 def _document(a: Result, b: Result, differences: dict[str, Difference], uncertainty: dict[str, Any]) -> dict[str, Any]:
+    metrics = {}
+    for name, found in differences.items():
+        numbers = {"a": a.metrics[name], "b": b.metrics[name]}
+        numbers |= {"difference": found.value, "low": found.low, "high": found.high}
+        finite = {key: value if math.isfinite(value) else None for key, value in numbers.items()}
+        metrics[name] = {**finite, "verdict": verdict(name, found)}
     return {
-        **{key: _origin(result) for key, result in (("a", a), ("b", b))},
+        **{
+            side: {"path": str(each.path), "split": each.split, "checkpoint": each.document.get("checkpoint")}
+            for side, each in (("a", a), ("b", b))
+        },
         "images": len(a.table.ids),
         "protocol": a.stamp,
         "data": a.data,
         "uncertainty": uncertainty,
-        "metrics": {
-            name: {
-                "a": _finite(a.metrics[name]),
-                "b": _finite(b.metrics[name]),
-                "difference": _finite(difference.value),
-                "low": _finite(difference.low),
-                "high": _finite(difference.high),
-                "verdict": verdict(name, difference),
-            }
-            for name, difference in differences.items()
-        },
+        "metrics": metrics,
     }
 
 
-def _origin(result: Result) -> dict[str, Any]:
-    return {"path": str(result.path), "split": result.split, "checkpoint": result.document.get("checkpoint")}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _per_image(a: ImageTable, b: ImageTable) -> str:
+def _per_image(a: ImageTable, b: ImageTable) -> Table:
     names = [name for name in PER_IMAGE if name in a.values and name in b.values]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     columns = [f"{name}_{side}" for name in names for side in ("a", "b", "difference")]
-    writer.writerow(["id", "scene", "category", "pixels", *columns])
     values = [x for name in names for x in (a.values[name], b.values[name], b.values[name] - a.values[name])]
+    table = Table(["id", "scene", "category", "pixels", *columns])
     for row in _by_difference(a, b, metric=PER_IMAGE[0]):
-        keys = (a.ids[row], a.scenes[row], a.categories[row], a.pixels[row])
-        writer.writerow([*keys, *(f"{column[row]:.9g}" for column in values)])
-    return text.getvalue()
+        keys = (a.ids[row], a.scenes[row], a.categories[row], str(a.pixels[row]))
+        table.add(*keys, *(f"{column[row]:.9g}" for column in values))
+    return table
 
 
-def _draw(path: Path, a: Result, b: Result, tables: tuple[ImageTable, ImageTable]) -> None:
-    metric = PER_IMAGE[0]
-    values = [table.values[metric] for table in tables]
-    title = f"a: {_name(a)}\nb: {_name(b)}"
-    ids = tables[0].ids
+def _draw(a: Result, b: Result, tables: tuple[ImageTable, ImageTable]) -> Any:
+    metric, ids = PER_IMAGE[0], tables[0].ids
     shown = [ids[row] for row in _by_difference(*tables, metric=metric)[:SHOWN]]
-    save_comparison(path, ids, *values, shown=shown, metric=metric, title=title)
+    title = f"a: {_name(a)}\nb: {_name(b)}"
+    return draw_comparison(ids, *(table.values[metric] for table in tables), shown=shown, metric=metric, title=title)
 
 
 def _name(result: Result) -> str:
-    """Return the run or study of a result, which its folder lies in as test/<protocol>."""
+    """Return the run or study of a result, two folders above test/<protocol>."""
     path = result.path.resolve()
     parts = path.parent.parent.parts if path.parent.name == "test" else path.parts
     return str(Path(*parts[-2:]))
 
 
 def print_comparison(a: Result, b: Result, differences: dict[str, Difference], uncertainty: dict[str, Any]) -> None:
-    """Print a row a metric to standard output: both results, their difference with its interval, and what it shows."""
-    out = Console()
-    if not out.is_terminal:
-        out = Console(width=130)  # a log should not wrap what a wide terminal would show
+    """Print one row per metric: both results, their difference with its interval, and the verdict."""
     kinds = " and ".join(dict.fromkeys(f"{result.split['kind']}" for result in (a, b)))
     count = uncertainty["scenes"]
     scenes = f"of {count} scene{'s' * (count != 1)}" if any(a.table.scenes) else "without scenes"
-    out.print(
-        f"a: {a.path}\nb: {b.path}\n{a.protocol_name} protocol, {len(a.table.ids)} test images {scenes} of "
-        f"{a.data['source']}, {kinds} split",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
-    )
+    images = f"{len(a.table.ids)} test images {scenes} of {a.data['source']}"
+    lines = f"a: {a.path}\nb: {b.path}\n{a.protocol_name} protocol, {images}, {kinds} split\n"
+    stdout().print(lines, markup=False, highlight=False, soft_wrap=True)
     level = f"{100 * LEVEL:.0f} %"
     table = Table(
+        ["metric", "a", "b", "b - a", f"{level} interval", "verdict"],
         caption=f"{level} intervals, each metric by itself: {uncertainty['method']}, {uncertainty['repeats']} draws. "
-        "They cover which scenes were tested, not which seed a network was trained with. ↑ higher is better, ↓ lower.",
-        caption_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),  # all of it fits into 80 columns
-        show_edge=False,
+        "They cover the choice of test scenes, not the seed of the training. ↑ higher is better, ↓ lower.",
     )
-    table.add_column("metric")
-    for name in ("a", "b", "b - a", f"{level} interval"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("verdict")
-    for name, difference in differences.items():
-        before, after = a.metrics[name], b.metrics[name]
+    for name, found in differences.items():
+        before, after, info = a.metrics[name], b.metrics[name], metric_info(name)
         places = 4 if not max(abs(before), abs(after)) >= 10 else 2
-        word = verdict(name, difference)
-        table.add_row(
-            escape(name + (f" [{UNITS[name]}]" if name in UNITS else "")) + (" ↑" if higher_is_better(name) else " ↓"),
-            f"{before:.{places}f}",
-            f"{after:.{places}f}",
-            f"{difference.value:+.{places}f}",
-            f"{difference.low:+.{places}f} to {difference.high:+.{places}f}",
-            f"[bold]{word}[/]" if word.endswith("better") else word,
+        word = verdict(name, found)
+        table.add(
+            f"{info.label} {info.arrow}",
+            *(f"{value:.{places}f}" for value in (before, after)),
+            f"{found.value:+.{places}f}",
+            f"{found.low:+.{places}f} to {found.high:+.{places}f}",
+            Cell(word, bold=word.endswith("better")),
         )
-    out.print("", table, sep="\n")
+    table.show(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)  # fits into 80 columns

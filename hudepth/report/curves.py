@@ -1,31 +1,31 @@
-"""Curves over the epochs of a run: figure 5 of the paper."""
+"""Loss curves of a run over its epochs (figure 5 of the paper)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hudepth.base.errors import DataError
 from hudepth.metrics.summary import DEPTH_NAMES
-from hudepth.viz.panels import save_figure
 
 
 def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> Figure:
-    """Draw training and validation curves of the total loss and of each of its terms, a plot each.
+    """Draw training and validation curves of the total loss and of its terms, one plot each.
 
     Args:
         history: rows with ``epoch``, ``train/<name>`` and ``val/<name>``.
-        title: above the figure.
+        title: of the figure.
 
     Raises:
         DataError: if the history holds no training loss.
     """
     names = [key.removeprefix("train/") for key in history[0] if key.startswith("train/")]
     if not names:
-        raise DataError("the history of epochs holds no training loss (train/total). Pass that of a training run.")
+        raise DataError(
+            "the history of epochs has no training loss (train/total). Pass the metrics.csv of a training run."
+        )
     names.sort(key=lambda name: name != "total")
     figure = Figure(figsize=(3.4 * len(names), 3.2), dpi=110, layout="constrained")
     if title:
@@ -47,8 +47,3 @@ def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> F
         axis.grid(alpha=0.3)
     axis.legend()
     return figure
-
-
-def save_curves(path: Path, history: Sequence[Mapping[str, float]], *, title: str = "") -> None:
-    """Write :func:`draw_curves` as a PNG file."""
-    save_figure(path, draw_curves(history, title=title))

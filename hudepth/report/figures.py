@@ -1,48 +1,57 @@
-"""hudepth-report figures: the paper's figures 5 and 6 of any run."""
+"""hudepth-report figures: loss curves and predictions of one run (figures 5 and 6 of the paper)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError, HudepthError
-from hudepth.base.options import whole_number
+from hudepth.base.options import Range, output_folder
 from hudepth.evaluation.pictures import evenly_spaced, run_panels
-from hudepth.report.curves import save_curves
+from hudepth.report.curves import draw_curves
 from hudepth.runs.history import read_history
 from hudepth.runs.run_dir import is_run, newest_run
-from hudepth.viz.panels import save_panels
+from hudepth.viz.panels import save_figure, save_panels
 
 
-def figures(config: dict[str, Any]) -> None:
-    """Draw the curves of the total loss and of each term, and panels of RGB, truth, prediction and error.
+@dataclass(frozen=True)
+class FiguresOptions:
+    """Options of ``hudepth-report figures``; conf/report.yaml explains them."""
 
-    The panels need the run's checkpoint and its data. Where one is missing, the curves are drawn all the same.
+    paths: Mapping[str, Any]
+    run: Annotated[Path, "a run directory or last"] = Path("last")
+    panels: Annotated[int, Range(0)] = 6
+    output: Path | None = None
+    data: Mapping[str, Any] = field(default_factory=dict)
+    trust: list[str] = field(default_factory=list)
 
-    Args:
-        config: with ``run``, ``panels``, ``data``, ``output``, ``paths`` and ``trust``.
+
+def draw_figures(options: FiguresOptions) -> None:
+    """Draw the curves of the loss and its terms, and panels of RGB, ground truth, prediction and error.
+
+    The panels need the run's checkpoint and its data. Where one is missing, only the curves are drawn.
 
     Raises:
-        HudepthError: if there is no run or no history of it.
+        HudepthError: if there is no such run, or it has no history.
     """
-    run = newest_run(config["paths"]["runs"]) if config["run"] == "last" else Path(str(config["run"])).expanduser()
+    run = newest_run(options.paths["runs"]) if options.run == Path("last") else options.run
     if not is_run(run):
-        raise ConfigError(f"run: '{run}' is no run directory. Pass run=<runs/name/date_time>, or run=last.")
-    output = Path(config["output"]).expanduser() if config["output"] else run / "figures"
-    count = whole_number(config, "panels", default=6)
+        raise ConfigError(f"run: '{run}' is not a run directory. Pass run=<runs/name/date_time>, or run=last.")
     history = read_history(run / "metrics.csv")
-    try:
-        save_curves(output / "curves.png", history, title=f"{run.parent.name}: loss and raw terms")
-    except OSError as error:
-        raise ConfigError(f"output: cannot write '{output}' ({error.strerror}). Pass output=<a folder>.") from error
-    log.info("total loss and each term, by epoch: %s", (output / "curves.png").resolve())
-    if not count:
+    output = output_folder(options.output or run / "figures")
+    save_figure(output / "curves.png", draw_curves(history, title=f"{run.parent.name}: loss and raw terms"))
+    log.info("total loss and its terms by epoch: %s", (output / "curves.png").resolve())
+    if not options.panels:
         return
     try:
-        panels = run_panels(run, lambda datamodule: evenly_spaced(sorted(datamodule.split.test), count), config=config)
+        panels = run_panels(
+            run, lambda data: evenly_spaced(sorted(data.split.test), options.panels), config=vars(options)
+        )
     except HudepthError as error:
         log.warning("no panels: %s", error)
         return
     save_panels(output / "panels.png", panels)
-    log.info("RGB, truth, prediction and error of %d test images: %s", len(panels), (output / "panels.png").resolve())
+    log.info("RGB, ground truth, prediction and error of %d test images: %s", len(panels), output / "panels.png")

@@ -1,21 +1,20 @@
-"""Two results image by image: which images one network does better than another, and by how much."""
+"""Two results image by image: which images each network predicts better, and by how much."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hudepth.viz.panels import save_figure
+from hudepth.viz.style import BLUE, ORANGE
 
-COLOURS = ("#0072b2", "#d55e00")
-"""Of a and b: told apart by everyone (Okabe and Ito 2008)."""
+SIDES = {"a": BLUE, "b": ORANGE}
 LONGEST = 32
-"""Letters of an id that fit beside a bar."""
+"""Letters of an image id that fit next to a bar."""
 
 
 def draw_comparison(
@@ -27,15 +26,15 @@ def draw_comparison(
     metric: str = "abs_rel",
     title: str = "",
 ) -> Figure:
-    """Draw each image's error under a against that under b, and beside it some images as pairs of bars.
+    """Draw each image's error under a against that under b, and some images as pairs of bars.
 
     Args:
         ids: of the images.
-        a: [n] each image's metric under a, smaller is better; NaN is left out of the left plot and said in the right.
+        a: [n] a metric of each image under a, smaller is better; NaN is left out on the left and written on the right.
         b: [n] the same under b.
         shown: ids for the right plot, from the top; they are ringed in the left one.
         metric: its name.
-        title: above the figure.
+        title: of the figure.
     """
     rows = [list(ids).index(image) for image in shown]
     figure = Figure(figsize=(11, 5.2), dpi=110, layout="constrained")
@@ -47,51 +46,33 @@ def draw_comparison(
     return figure
 
 
-def save_comparison(
-    path: Path,
-    ids: Sequence[str],
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    *,
-    shown: Sequence[str],
-    metric: str = "abs_rel",
-    title: str = "",
-) -> None:
-    """Write :func:`draw_comparison` as a PNG file, whole or not at all."""
-    save_figure(path, draw_comparison(ids, a, b, shown=shown, metric=metric, title=title))
-
-
 def _scatter(axis: Axes, a: NDArray[np.float64], b: NDArray[np.float64], *, rows: Sequence[int], metric: str) -> None:
     finite = np.isfinite(a) & np.isfinite(b)
     highest = 1.05 * float(max(a[finite].max(initial=0), b[finite].max(initial=0))) or 1.0
-    for better, worse, name, colour in ((a, b, "a", COLOURS[0]), (b, a, "b", COLOURS[1])):
-        won = finite & (better < worse)
+    for name, won in (("a", finite & (a < b)), ("b", finite & (b < a))):
         label = f"{name} better: {np.count_nonzero(won)} images"
-        axis.scatter(a[won], b[won], s=12, color=colour, alpha=0.6, linewidths=0, label=label)
+        axis.scatter(a[won], b[won], s=12, color=SIDES[name], alpha=0.6, linewidths=0, label=label)
     even = finite & (a == b)
     if even.any():
         axis.scatter(a[even], b[even], s=12, color="0.5", linewidths=0, label=f"equal: {np.count_nonzero(even)} images")
-    axis.scatter(
-        a[rows], b[rows], s=55, facecolors="none", edgecolors="0.2", linewidths=0.8, label="shown on the right"
-    )
+    ring: dict[str, Any] = {"s": 55, "facecolors": "none", "edgecolors": "0.2", "linewidths": 0.8}
+    axis.scatter(a[rows], b[rows], label="shown on the right", **ring)
     axis.plot([0, highest], [0, highest], color="0.5", linewidth=0.8, zorder=0)
-    axis.set_xlim(0, highest)
-    axis.set_ylim(0, highest)
-    axis.set_aspect("equal")
+    axis.set(xlim=(0, highest), ylim=(0, highest), aspect="equal")
     axis.grid(alpha=0.3)
-    axis.set_xlabel(f"{metric} under a")
-    axis.set_ylabel(f"{metric} under b")
+    axis.set(xlabel=f"{metric} under a", ylabel=f"{metric} under b")
     axis.set_title(f"{metric} of each image", fontsize=10)
     axis.legend(fontsize=8)
 
 
 def _bars(axis: Axes, names: Sequence[str], a: NDArray[np.float64], b: NDArray[np.float64], *, metric: str) -> None:
     places = np.arange(len(names))
-    for values, offset, label, colour in ((a, -0.2, "a", COLOURS[0]), (b, 0.2, "b", COLOURS[1])):
-        axis.barh(places + offset, np.nan_to_num(values, posinf=0), height=0.38, color=colour, label=label)
+    for label, values, offset in (("a", a, -0.2), ("b", b, 0.2)):
+        lengths = np.nan_to_num(values, posinf=0)
+        axis.barh(places + offset, lengths, height=0.38, color=SIDES[label], label=label)
         for place, value in zip(places + offset, values, strict=True):
-            if not np.isfinite(value):  # a bar has no length to say so
-                axis.text(0, place, f" {value}", va="center", fontsize=7, color=colour)
+            if not np.isfinite(value):  # no bar can show it
+                axis.text(0, place, f" {value}", va="center", fontsize=7, color=SIDES[label])
     axis.set_yticks(places, [name if len(name) <= LONGEST else f"…{name[1 - LONGEST :]}" for name in names], fontsize=8)
     axis.set_ylim(len(names) - 0.5, -0.5)
     axis.grid(axis="x", alpha=0.3)

@@ -1,58 +1,76 @@
-"""hudepth-report table: results of several runs in one table, with all that keeps them from comparing beside them."""
+"""hudepth-report table: results of several runs in one table, with whatever keeps them from being compared."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.table import Table
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
 from hudepth.base.files import write_text
-from hudepth.evaluation.tables import NARROW as METRICS
+from hudepth.base.options import output_folder
+from hudepth.base.tables import Table, stdout
 from hudepth.metrics.bootstrap import intervals
+from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.runs.results import Result, find_result, merge
 from hudepth.runs.run_dir import CHECKPOINTS
 
-FEW = ("abs_rel", "rmse", "ssim", "delta1")
-"""Columns in a terminal too narrow for all; the files always have all."""
+WIDE, LOG_WIDTH = 190, 200
+"""Letters that all metrics need in a line; of a log."""
 
 
-def table(config: dict[str, Any]) -> None:
+@dataclass(frozen=True)
+class TableOptions:
+    """Options of ``hudepth-report table``; conf/report.yaml explains them."""
+
+    runs: list[Path]
+    protocols: list[str]
+    output: Path | None = None
+    trust: list[str] = field(default_factory=list)
+
+
+def write_table(options: TableOptions) -> None:
     """Print a row for each run and protocol, with 95 % intervals; write table.csv and table.md.
 
-    Where protocols, data or splits differ, columns say in what.
-
-    Args:
-        config: ``runs`` (run directories or folders of test results), ``protocol`` (names) and ``output``.
+    Where protocols, data or splits differ, columns state how.
 
     Raises:
-        HudepthError: if a run has no result of a protocol.
+        HudepthError: if a run has no result under a protocol.
     """
-    if not config["runs"]:
+    if not options.runs:
         raise ConfigError("runs is not set. Pass runs=[<run directory>,<run directory>].")
-    results = _results([Path(str(run)).expanduser() for run in config["runs"]], config["protocol"])
-    rows = merge(results, metrics=METRICS, mark=True)
-    marks = [key for key in rows[0] if key != "name" and key not in METRICS]
+    results = _results(options.runs, options.protocols)
+    names = metric_names("narrow")
+    rows: Sequence[Mapping[str, Any]] = merge(results, metrics=names, mark=True)
     ranges = {name: intervals(result.table, **result.averaging) for name, result in results.items()}
-    output = Path(config["output"] or "table").expanduser()
-    try:
-        write_text(output / "table.csv", _csv(rows, ranges))
-        write_text(output / "table.md", _markdown(rows, ranges, marks))
-    except OSError as error:
-        raise ConfigError(f"output: cannot write '{output}' ({error.strerror}). Pass output=<a folder>.") from error
-    _print(rows, ranges, marks)
+    marks = [key for key in rows[0] if key != "name" and key not in names]
+
+    def tabulate(metrics: Sequence[str], *, between: str = " ") -> Table:
+        columns = ["", *marks, *(f"{metric_info(name).label} {metric_info(name).arrow}" for name in metrics)]
+        table = Table(columns, left=1 + len(marks), caption="in brackets: 95 % intervals over scenes")
+        for row in rows:
+            cells = (_cell(name, row[name], ranges[row["name"]].get(name), between) for name in metrics)
+            table.add(row["name"], *(row[key] for key in marks), *cells)
+        return table
+
+    numbers = Table(["name", *marks, *(f"{name}{part}" for name in names for part in ("", "_low", "_high"))])
+    for row in rows:
+        values = [x for name in names for x in (row[name], *ranges[row["name"]].get(name, (math.nan, math.nan)))]
+        numbers.add(row["name"], *(row[key] for key in marks), *(f"{value:.9g}" for value in values))
+    output = output_folder(options.output or "table")
+    write_text(output / "table.csv", numbers.to_csv())
+    full = tabulate(names)
+    write_text(output / "table.md", f"{full.to_markdown()}\n{full.caption.capitalize()}.\n")
+    shown = names if stdout(LOG_WIDTH).width >= WIDE else metric_names("headline")
+    tabulate(shown, between="\n").show(LOG_WIDTH)
     log.info("as text: %s", output.resolve())
 
 
 def _results(runs: Sequence[Path], protocols: Sequence[str]) -> dict[str, Result]:
-    # a run directory is called by its date; what it is, the folder above says
+    # the name of a run directory is a date; the folder above it names the run
     short = [run.resolve().parent.name if (run / CHECKPOINTS).is_dir() else run.resolve().name for run in runs]
     found: dict[str, Result] = {}
     for run, name in zip(runs, short, strict=True):
@@ -65,47 +83,8 @@ def _results(runs: Sequence[Path], protocols: Sequence[str]) -> dict[str, Result
     return found
 
 
-Rows = Sequence[dict[str, Any]]
-Ranges = dict[str, dict[str, tuple[float, float]]]
-
-
-def _csv(rows: Rows, ranges: Ranges) -> str:
-    text = io.StringIO()
-    marks = [key for key in rows[0] if key not in METRICS]
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*marks, *(f"{metric}{part}" for metric in METRICS for part in ("", "_low", "_high"))])
-    for row in rows:
-        values = [(row[metric], *ranges[row["name"]].get(metric, (math.nan, math.nan))) for metric in METRICS]
-        writer.writerow([*(row[key] for key in marks), *(f"{x:.9g}" for triple in values for x in triple)])
-    return text.getvalue()
-
-
-def _markdown(rows: Rows, ranges: Ranges, marks: Sequence[str]) -> str:
-    names = ["", *marks, *METRICS]
-    lines = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
-    for row in rows:
-        cells = [row["name"], *(row[key] for key in marks), *(" ".join(_cell(row, ranges, m)) for m in METRICS)]
-        lines.append(f"| {' | '.join(str(cell).replace('|', '&#124;') for cell in cells)} |")
-    return "\n".join([*lines, "", "In brackets: 95 % intervals by scene; rmse in metres.", ""])
-
-
-def _cell(row: dict[str, Any], ranges: Ranges, metric: str) -> tuple[str, str]:
-    low, high = ranges[row["name"]].get(metric, (math.nan, math.nan))
-    interval = "" if math.isnan(low) else f"[{low:.3f}, {high:.3f}]"
-    return "-" if math.isnan(row[metric]) else f"{row[metric]:.3f}", interval
-
-
-def _print(rows: Rows, ranges: Ranges, marks: Sequence[str]) -> None:
-    out = Console()
-    if not out.is_terminal:
-        out = Console(width=200)
-    shown = Table(caption="rmse in metres; delta and ssim: higher is better; in brackets: 95 % by scene")
-    for name in ("", *marks):
-        shown.add_column(name, overflow="fold", min_width=10 if name else 20)
-    metrics = METRICS if out.width >= 190 else FEW
-    for metric in metrics:
-        shown.add_column(metric, justify="right", no_wrap=True)
-    for row in rows:
-        cells = ["\n".join(_cell(row, ranges, metric)) for metric in metrics]
-        shown.add_row(row["name"], *(row[key] for key in marks), *(cell.replace("[", "\\[") for cell in cells))
-    out.print(shown)
+def _cell(name: str, value: float, interval: tuple[float, float] | None, between: str) -> str:
+    info = metric_info(name)
+    if interval is None or math.isnan(interval[0]):
+        return info.format(value)
+    return f"{info.format(value)}{between}[{info.format(interval[0])}, {info.format(interval[1])}]"

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hudepth.base.errors import DataError
-from hudepth.report.curves import draw_curves, save_curves
+from hudepth.report.curves import draw_curves
 from hudepth.runs.history import read_history
 
 TERMS = ("boundary", "scaling", "smoothness", "total")
@@ -87,16 +87,8 @@ def test_losses_start_at_zero() -> None:
 
 
 def test_no_training_loss() -> None:
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=r"train/total"):
         draw_curves([{"epoch": 1.0, "val/abs_rel": 0.2}])
-    assert str(caught.value) == (
-        "the history of epochs holds no training loss (train/total). Pass that of a training run."
-    )
-
-
-def test_curves_are_a_file(tmp_path: Path) -> None:
-    save_curves(tmp_path / "curves.png", history(3))
-    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_history_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -112,20 +104,19 @@ def test_history_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (None, "cannot be read as a history of epochs ([Errno 2] No such file or directory: '{path}')."),
-        ("", "holds no finished epoch."),
-        ("epoch,train/total\n", "holds no finished epoch."),
-        ("epoch\nmany\n", "cannot be read as a history of epochs (could not convert string to float: 'many')."),
-        ("train/total\n0.1\n", "is no history of epochs: it has rows without an epoch."),
+        (None, "No such file"),
+        ("", "epoch"),
+        ("epoch,train/total\n", "epoch"),
+        ("epoch\nmany\n", "'many'"),
+        ("train/total\n0.1\n", "without an epoch"),
     ],
-)  # fmt: skip
+)
 def test_no_history(tmp_path: Path, content: str | None, why: str) -> None:
     path = tmp_path / "metrics.csv"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=rf"metrics\.csv'.*{why}"):
         read_history(path)
-    assert str(caught.value) == f"'{path}' {why.format(path=path)}"
 
 
 @pytest.mark.parametrize("content", [b"epoch,train/total\n1,0.1,7\n", b"\xff\xfe\x00", b"epoch\n1\x00\n"])

@@ -11,7 +11,8 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hudepth.report.scatter import draw_comparison, save_comparison
+from hudepth.report.scatter import draw_comparison
+from hudepth.viz.panels import save_figure
 
 IDS = ["near", "far", "same", "bad", "worst"]
 A = np.array([0.1, 0.4, 0.2, np.nan, 0.9])
@@ -91,5 +92,5 @@ def test_nothing_is_cut_off_and_the_plots_do_not_overlap(count: int) -> None:
 @pytest.mark.parametrize("values", [[0.0, 0.0], [np.nan, np.nan], [np.inf, 0.5]])
 def test_odd_values_are_drawn_all_the_same(tmp_path: Path, values: list[float]) -> None:
     path = tmp_path / "new" / "compare.png"
-    save_comparison(path, ["x", "y"], np.array(values), np.array([0.0, 0.0]), shown=["x", "y"])
+    save_figure(path, draw_comparison(["x", "y"], np.array(values), np.array([0.0, 0.0]), shown=["x", "y"]))
     assert path.read_bytes().startswith(b"\x89PNG")

@@ -17,7 +17,7 @@ from hudepth.report.ablation.page import Picture
 from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.row import Row
 from hudepth.report.ablation.variants import save_variants
-from hudepth.report.compare import of_training_data
+from hudepth.report.compare import tested_on_training_data
 from hudepth.runs.history import read_history
 from hudepth.runs.run_dir import BEST, CHECKPOINTS, LAST
 
@@ -124,7 +124,7 @@ def _panels(report: Report, path: Path, config: Mapping[str, Any]) -> Said:
         label: each.run.path
         for label, each in runs.items()
         if any((each.run.path / CHECKPOINTS / name).is_file() for name in (BEST, LAST))
-        and of_training_data(each.result)
+        and tested_on_training_data(each.result)
     }
     if not usable:
         log.info("no panels.png: no run has its checkpoint and was tested on the data it was trained on")

@@ -66,18 +66,16 @@ class Rows:
     troubles: list[Trouble]
 
 
-def sort_runs(
-    sweep: Sweep, protocol: str, *, going_through: Callable[[list[SweepRun]], Iterable[SweepRun]] = iter
-) -> Rows:
+def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[SweepRun]], Iterable[SweepRun]] = iter) -> Rows:
     """Read the results of a sweep's runs and sort them into rows, in the order of the sweep.
 
     Args:
         sweep: as read.
         protocol: whose results to read.
-        going_through: wraps the list of runs, for a progress bar.
+        track: wraps the list of runs, for a progress bar.
     """
     groups: dict[str, list[tuple[SweepRun, Result | str]]] = {}
-    for run in going_through(sweep.runs):
+    for run in track(sweep.runs):
         groups.setdefault(variant_key(run.config), []).append((run, _result(run, protocol)))
     variants = [_variant([run for run, _ in group]) for group in groups.values()]
     factors = find_factors([each.config for each in variants])
