@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,31 +18,39 @@ LOG_WIDTH = 130
 _LATEX = {c: f"\\{c}" for c in "&%$#_{}"} | {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"\(\uparrow\)",
     "↓": r"\(\downarrow\)", "±": r"\(\pm\)", "−": r"\(-\)", "≥": r"\(\geq\)", "²": r"\(^2\)",
+    "<": r"\textless{}", ">": r"\textgreater{}", "…": r"\dots{}",
+    "†": r"\textsuperscript{\dag}", "⁺": r"\textsuperscript{+}", "⁻": r"\textsuperscript{\(-\)}",
 }  # fmt: skip
+_MARKDOWN = {"|": "&#124;", "<": "&lt;", "*": r"\*"}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Text of a cell; a plain string serves where it has no style."""
+    """Text of a cell, or of a part of one; a plain string serves where it has no style."""
 
     text: str
     bold: bool = False
     dim: bool = False
+    """Grey on a terminal, small in LaTeX."""
+
+
+Content = str | Cell | tuple[Cell, ...]
+"""Of a cell; parts are joined by spaces."""
 
 
 @dataclass
 class Table:
-    """Rows under named columns. Cells are strings or :class:`Cell`; a line break in one makes it taller."""
+    """Rows under named columns. A line break makes a cell taller."""
 
     columns: Sequence[str]
-    rows: list[Sequence[str | Cell]] = field(default_factory=list)
+    rows: list[Sequence[Content]] = field(default_factory=list)
     title: str = ""
     caption: str = ""
     """Below the table."""
     left: int = 1
     """How many columns, from the first on, are aligned to the left."""
 
-    def add(self, *cells: str | Cell) -> None:
+    def add(self, *cells: Content) -> None:
         """Append a row."""
         self.rows.append(cells)
 
@@ -57,7 +65,7 @@ class Table:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self.columns)
-        writer.writerows([_cell(cell).text for cell in row] for row in self.rows)
+        writer.writerows([_join(cell, lambda part: part.text) for cell in row] for row in self.rows)
         return text.getvalue()
 
     def to_latex(self) -> str:
@@ -78,7 +86,7 @@ class Table:
         for i, name in enumerate(self.columns):
             table.add_column(escape(name), justify="left" if i < self.left else "right", no_wrap=i >= self.left)
         for row in self.rows:
-            table.add_row(*(_rich(_cell(cell)) for cell in row))
+            table.add_row(*(_join(cell, _rich) for cell in row))
         return table
 
     def show(self, log_width: int = LOG_WIDTH, **style: Any) -> None:
@@ -93,28 +101,39 @@ def stdout(log_width: int = LOG_WIDTH) -> Console:
     return Console() if sys.stdout.isatty() else Console(width=log_width)
 
 
-def _cell(cell: str | Cell) -> Cell:
-    return cell if isinstance(cell, Cell) else Cell(cell)
+def escape_markdown(text: str) -> str:
+    """Return text in which nothing is markup."""
+    return "".join(_MARKDOWN.get(letter, letter) for letter in text)
 
 
-def _rich(cell: Cell) -> str:
+def escape_latex(text: str) -> str:
+    """Return text in which nothing is a command; symbols of these tables become their commands."""
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+def _join(cell: Content, style: Callable[[Cell], str]) -> str:
+    parts = cell if isinstance(cell, tuple) else (cell if isinstance(cell, Cell) else Cell(cell),)
+    return " ".join(filter(None, map(style, parts))).replace(" \n", "\n")
+
+
+def _rich(part: Cell) -> str:
     from rich.markup import escape
 
-    text = escape(cell.text)
-    return f"[bold]{text}[/]" if cell.bold else f"[dim]{text}[/]" if cell.dim else text
+    text = escape(part.text)
+    return f"[bold]{text}[/]" if part.bold else f"[dim]{text}[/]" if part.dim else text
 
 
-def _markdown_row(cells: Iterable[str | Cell]) -> str:
-    def text(cell: Cell) -> str:
-        escaped = cell.text.replace("|", "&#124;").replace("\n", " ")
-        return f"**{escaped}**" if cell.bold else escaped
+def _markdown_row(cells: Iterable[Content]) -> str:
+    def style(part: Cell) -> str:
+        text = escape_markdown(part.text).replace("\n", " ")
+        return f"**{text}**" if part.bold else text
 
-    return f"| {' | '.join(text(_cell(cell)) for cell in cells)} |"
+    return f"| {' | '.join(_join(cell, style) for cell in cells)} |"
 
 
-def _latex_row(cells: Iterable[str | Cell]) -> str:
-    def text(cell: Cell) -> str:
-        escaped = "".join(_LATEX.get(c, c) for c in cell.text.replace("\n", " "))
-        return rf"\textbf{{{escaped}}}" if cell.bold else escaped
+def _latex_row(cells: Iterable[Content]) -> str:
+    def style(part: Cell) -> str:
+        text = escape_latex(part.text.replace("\n", " "))
+        return rf"\textbf{{{text}}}" if part.bold else rf"{{\scriptsize {text}}}" if part.dim else text
 
-    return " & ".join(text(_cell(cell)) for cell in cells) + r" \\"
+    return " & ".join(_join(cell, style) for cell in cells) + r" \\"

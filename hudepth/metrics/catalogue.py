@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-Level = Literal["headline", "narrow", "wide", "edges", "files"]
-LEVELS: tuple[Level, ...] = ("headline", "narrow", "wide")
+Level = Literal["headline", "narrow", "wide", "edge", "edges", "files"]
+LEVELS: tuple[tuple[Level, ...], ...] = (("headline", "narrow", "wide"), ("edge", "edges"))
 """Tables of rising width; each has the metrics of those before it."""
 
 
@@ -26,8 +26,8 @@ class MetricInfo:
     higher_is_better: bool = False
     decimals: int = 3
     shown: Level = "files"
-    """The narrowest table that has it: ``headline``, ``narrow`` or ``wide``; ``edges``: the table of depth edges;
-    ``files``: metrics.json alone."""
+    """The narrowest table that has it: ``headline``, ``narrow`` or ``wide``; of depth edges ``edge`` (in tables of
+    many runs too) or ``edges``; ``files``: metrics.json alone."""
 
     @property
     def label(self) -> str:
@@ -59,6 +59,10 @@ def register(info: MetricInfo) -> None:
     _CATALOGUE[info.name] = info
 
 
+def _edge_level(kind: str, threshold: str) -> Level:
+    return "files" if kind != "f1" else "edges" if threshold == "1" else "edge"
+
+
 for _info in (
     MetricInfo("abs_rel", _PAPER, shown="headline"),
     MetricInfo("sq_rel", _EIGEN, unit="m", shown="wide"),
@@ -73,11 +77,11 @@ for _info in (
     MetricInfo("delta2", _EIGEN, higher_is_better=True, shown="narrow"),
     MetricInfo("delta3", _EIGEN, higher_is_better=True, shown="narrow"),
     *(
-        MetricInfo(f"edge_{kind}_{threshold}", _HU, higher_is_better=True, shown="edges" if kind == "f1" else "files")
+        MetricInfo(f"edge_{kind}_{threshold}", _HU, higher_is_better=True, shown=_edge_level(kind, threshold))
         for kind in ("precision", "recall", "f1")
         for threshold in ("0.25", "0.5", "1")
     ),
-    MetricInfo("si_boundary_f1", "Bochkovskii et al. 2024 (Depth Pro)", higher_is_better=True, shown="edges"),
+    MetricInfo("si_boundary_f1", "Bochkovskii et al. 2024 (Depth Pro)", higher_is_better=True, shown="edge"),
     MetricInfo("dbe_acc_px", _DBE, unit="px", shown="edges"),
     MetricInfo("dbe_comp_px", _DBE, unit="px", shown="edges"),
 ):
@@ -97,6 +101,6 @@ def metric_names(shown: Level, *, among: Iterable[str] | None = None) -> list[st
         shown: how wide the table is.
         among: only these; default: all.
     """
-    levels = LEVELS[: LEVELS.index(shown) + 1] if shown in LEVELS else (shown,)
+    levels = next((level[: level.index(shown) + 1] for level in LEVELS if shown in level), (shown,))
     names = [name for name, info in _CATALOGUE.items() if info.shown in levels]
     return names if among is None else [name for name in names if name in set(among)]
