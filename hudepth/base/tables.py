@@ -6,7 +6,7 @@ import csv
 import io
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class Table:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self.columns)
-        writer.writerows([_join(cell, lambda part: part.text) for cell in row] for row in self.rows)
+        writer.writerows([_join(cell) for cell in row] for row in self.rows)
         return text.getvalue()
 
     def to_latex(self) -> str:
@@ -111,9 +111,12 @@ def escape_latex(text: str) -> str:
     return "".join(_LATEX.get(letter, letter) for letter in text)
 
 
-def _join(cell: Content, style: Callable[[Cell], str]) -> str:
-    parts = cell if isinstance(cell, tuple) else (cell if isinstance(cell, Cell) else Cell(cell),)
-    return " ".join(filter(None, map(style, parts))).replace(" \n", "\n")
+def _join(cell: Content, style: Callable[[Cell], str] = lambda part: part.text) -> str:
+    text = ""
+    for part in cell if isinstance(cell, tuple) else (cell if isinstance(cell, Cell) else Cell(cell),):
+        breaks, words = part.text.startswith("\n"), style(replace(part, text=part.text.removeprefix("\n")))
+        text += f"\n{words}" if breaks else f" {words}" if text else words
+    return text
 
 
 def _rich(part: Cell) -> str:
@@ -125,15 +128,15 @@ def _rich(part: Cell) -> str:
 
 def _markdown_row(cells: Iterable[Content]) -> str:
     def style(part: Cell) -> str:
-        text = escape_markdown(part.text).replace("\n", " ")
+        text = escape_markdown(part.text)
         return f"**{text}**" if part.bold else text
 
-    return f"| {' | '.join(_join(cell, style) for cell in cells)} |"
+    return f"| {' | '.join(_join(cell, style) for cell in cells)} |".replace("\n", " ")
 
 
 def _latex_row(cells: Iterable[Content]) -> str:
     def style(part: Cell) -> str:
-        text = escape_latex(part.text.replace("\n", " "))
+        text = escape_latex(part.text)
         return rf"\textbf{{{text}}}" if part.bold else rf"{{\scriptsize {text}}}" if part.dim else text
 
-    return " & ".join(_join(cell, style) for cell in cells) + r" \\"
+    return " & ".join(_join(cell, style) for cell in cells).replace("\n", " ") + r" \\"

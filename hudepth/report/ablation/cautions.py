@@ -1,4 +1,4 @@
-"""What a reader of a sweep's table should know before believing it, a line each."""
+"""What a reader of a sweep's table should know before trusting it, one line each."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hudepth.report.ablation.row import Row
+from hudepth.report.ablation.rows import Row
 
 UNKNOWN = "unknown"
 NAMED = 3
-"""Runs or rows that a line names before it counts the others."""
+"""Most runs that a line lists by name."""
 
 
 def undefined(table: Sequence[Row], metrics: Sequence[str]) -> list[str]:
-    """Name rows with a seed in which a metric is undefined, so that they have no mean."""
+    """List rows without a mean, since a metric is undefined for one of their seeds."""
     lines = []
     for row in table:
         gaps: dict[str, list[str]] = {}
@@ -31,7 +31,7 @@ def undefined(table: Sequence[Row], metrics: Sequence[str]) -> list[str]:
 
 
 def unpaired(table: Sequence[Row], reference: Row) -> list[str]:
-    """Name rows whose seeds are not all those of the reference."""
+    """List rows whose seeds are not those of the reference."""
     lines = []
     for row in table:
         if row is reference or not row.runs or row.differs or reference.differs:
@@ -44,7 +44,7 @@ def unpaired(table: Sequence[Row], reference: Row) -> list[str]:
 
 
 def versions_of(table: Sequence[Row]) -> dict[str, list[str]]:
-    """Return the names of the runs that count by the version of hudepth that they were trained with."""
+    """Return the names of the runs that count, by the version of hudepth that trained them."""
     versions: dict[str, list[str]] = {}
     for row in table:
         for each in row.runs.values():
@@ -53,7 +53,7 @@ def versions_of(table: Sequence[Row]) -> dict[str, list[str]]:
 
 
 def other_versions(versions: Mapping[str, Sequence[str]], reference: Row) -> list[str]:
-    """Say in one line which runs are of another version than the reference's first."""
+    """Return one line on the runs of another version than the reference's first run, if there are any."""
     if len(versions) < 2:
         return []
     own = next(iter(reference.runs.values())).run.path.name

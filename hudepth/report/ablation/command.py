@@ -13,13 +13,12 @@ from hudepth.base.errors import HudepthError
 from hudepth.base.files import write_json, write_text
 from hudepth.base.options import Range, output_folder
 from hudepth.metrics.bootstrap import REPEATS, SEED
-from hudepth.report.ablation.console import print_table
 from hudepth.report.ablation.document import document, table_csv
-from hudepth.report.ablation.markup import table_md, table_tex
 from hudepth.report.ablation.page import page
 from hudepth.report.ablation.pictures import draw_pictures
 from hudepth.report.ablation.report import Report, make_report
-from hudepth.report.ablation.runs import Rows, sort_runs
+from hudepth.report.ablation.rows import Rows, sort_runs
+from hudepth.report.ablation.tables import print_table, table_md, table_tex
 from hudepth.runs.sweeps import Sweep, read_jobs, read_sweep
 
 FOLDER = "report"
@@ -54,7 +53,7 @@ def report_sweep(options: SweepOptions) -> None:
     reports = tuple(f"left alone: '{path}' " for path in (options.dir / FOLDER, output))  # earlier ones
     sweep = replace(sweep, notes=[note for note in sweep.notes if not note.startswith(reports)])
     rows = sort_runs(sweep, options.protocol, track=lambda runs: track(runs, total=len(runs), what="reading runs"))
-    report = _work_out(rows, sweep, options)
+    report = _compute(rows, sweep, options)
     for line in [*report.warnings, *sweep.notes]:
         log.warning("%s", line)
     print_table(report)
@@ -62,7 +61,7 @@ def report_sweep(options: SweepOptions) -> None:
     log.info("page, tables and pictures: %s", (output / "report.html").resolve())
 
 
-def _work_out(rows: Rows, sweep: Sweep, options: SweepOptions) -> Report:
+def _compute(rows: Rows, sweep: Sweep, options: SweepOptions) -> Report:
     try:
         return make_report(
             rows, protocol=options.protocol, reference=options.reference, repeats=options.repeats, seed=options.seed

@@ -1,16 +1,15 @@
-"""A sweep's table for programs: table.csv and document.json, all numbers with all their digits."""
+"""A sweep's table for programs: table.csv and document.json, with all digits of all numbers."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from typing import Any
 
+from hudepth.base.tables import Table
 from hudepth.report.ablation.estimates import Contrast, Estimate, Interval
 from hudepth.report.ablation.factors import config_differences
 from hudepth.report.ablation.report import Report
-from hudepth.report.ablation.row import Row
+from hudepth.report.ablation.rows import Row
 from hudepth.runs.sweeps import Sweep
 
 PARTS = (
@@ -19,52 +18,40 @@ PARTS = (
     "_difference_scenes_high", "_paired_seeds", "_verdict",
 )  # fmt: skip
 """What follows a metric's name in the columns of table.csv."""
+OWN = ("row", "reference", "seeds", "seeds_tried", "differs")
+"""Columns whose names no factor may take."""
 
 
 def table_csv(report: Report) -> str:
-    """Return table.csv: a row a row, empty cells where there is no number."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    factors = [_free(factor.name) for factor in report.factors]
-    writer.writerow(
-        ["row", *factors, "reference", "seeds", "seeds_tried", "differs"]
-        + [f"{name}{part}" for name in report.metrics for part in PARTS]
-    )
+    """Return table.csv: one row per variant, empty cells where there is no number."""
+    factors = [f"factor_{factor.name}" if factor.name in OWN else factor.name for factor in report.factors]
+    numbers = [f"{name}{part}" for name in report.metrics for part in PARTS]
+    table = Table(["row", *factors, *OWN[1:], *numbers])
     for row in report.rows:
-        cells = [row.label, *row.variant.factors, _truth(row.is_reference), len(row.runs), len(row.variant.seeds)]
-        writer.writerow([*cells, "; ".join(row.differs), *(x for name in report.metrics for x in _cells(row, name))])
-    return text.getvalue()
-
-
-def _free(name: str) -> str:
-    return f"factor_{name}" if name in ("row", "reference", "seeds", "seeds_tried", "differs") else name
-
-
-def _truth(value: bool) -> str:
-    return "true" if value else "false"
+        counts = (str(row.is_reference).lower(), str(len(row.runs)), str(len(row.variant.seeds)))
+        cells = (cell for name in report.metrics for cell in _cells(row, name))
+        table.add(row.label, *row.variant.factors, *counts, "; ".join(row.differs), *cells)
+    return table.to_csv()
 
 
 def _cells(row: Row, name: str) -> list[str]:
     found, difference = row.estimates.get(name), row.contrasts.get(name)
     if found is None:
         return [""] * len(PARTS)
-    cells = [_digits(x) for x in (found.mean, *_ends(found.seeds), *_ends(found.scenes))] + [_truth(name in row.best)]
+    cells = [*_digits(found.mean, found.seeds, found.scenes), str(name in row.best).lower()]
     if difference is None:
         return cells + [""] * (len(PARTS) - len(cells))
-    numbers = (difference.value, *_ends(difference.seeds), *_ends(difference.scenes))
-    return [*cells, *(_digits(x) for x in numbers), str(len(difference.paired)), difference.verdict]
+    numbers = _digits(difference.value, difference.seeds, difference.scenes)
+    return [*cells, *numbers, str(len(difference.paired)), difference.verdict]
 
 
-def _digits(value: float) -> str:
-    return repr(float(value)) if math.isfinite(value) else ""
-
-
-def _ends(interval: Interval) -> tuple[float, float]:
-    return interval.low, interval.high
+def _digits(value: float, seeds: Interval, scenes: Interval) -> list[str]:
+    numbers = (value, seeds.low, seeds.high, scenes.low, scenes.high)
+    return [repr(float(x)) if math.isfinite(x) else "" for x in numbers]
 
 
 def document(report: Report, sweep: Sweep) -> dict[str, Any]:
-    """Return document.json: everything a report says, null where there is no number."""
+    """Return document.json: everything in a report, null where there is no number."""
     return {
         "sweep": str(sweep.folder),
         "protocol": report.first.stamp,
@@ -99,26 +86,17 @@ def _row(row: Row, report: Report) -> dict[str, Any]:
 
 
 def _estimate(found: Estimate, best: bool) -> dict[str, Any]:
-    return {
-        "mean": _finite(found.mean),
-        "by_seed": {seed: _finite(value) for seed, value in found.values.items()},
-        "seeds": _pair(found.seeds),
-        "scenes": _pair(found.scenes),
-        "best": best,
-    }
+    by_seed = {seed: _finite(value) for seed, value in found.values.items()}
+    ends = {"seeds": _ends(found.seeds), "scenes": _ends(found.scenes)}
+    return {"mean": _finite(found.mean), "by_seed": by_seed, **ends, "best": best}
 
 
 def _contrast(found: Contrast) -> dict[str, Any]:
-    return {
-        "value": _finite(found.value),
-        "seeds": _pair(found.seeds),
-        "scenes": _pair(found.scenes),
-        "paired_seeds": found.paired,
-        "verdict": found.verdict,
-    }
+    ends = {"seeds": _ends(found.seeds), "scenes": _ends(found.scenes)}
+    return {"value": _finite(found.value), **ends, "paired_seeds": found.paired, "verdict": found.verdict}
 
 
-def _pair(interval: Interval) -> list[float | None] | None:
+def _ends(interval: Interval) -> list[float | None] | None:
     return [_finite(interval.low), _finite(interval.high)] if interval.known else None
 
 

@@ -1,55 +1,44 @@
-"""Differences from the reference, a line each: which rows are better, by how much, and how sure that is."""
+"""Differences from the reference, one line per row, with both intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from hudepth.metrics.summary import higher_is_better
+from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.report.ablation.estimates import BETTER, NOT_SHOWN, WORSE, Contrast, Interval
-from hudepth.report.ablation.report import UNITS, Report
-from hudepth.report.ablation.row import Row
+from hudepth.report.ablation.report import Report
+from hudepth.report.ablation.rows import Row
 from hudepth.viz.limits import usual_range
-from hudepth.viz.panels import save_figure
+from hudepth.viz.style import BLUE, ORANGE, shorten, strip_frame
 
-COLOURS = {BETTER: "#0072b2", WORSE: "#d55e00", NOT_SHOWN: "0.45"}
-"""Told apart by everyone (Okabe and Ito 2008)."""
-METRICS = ("abs_rel", "rmse", "delta1")
-LONGEST = 34
-"""Letters of a row's label."""
+COLOURS = {BETTER: BLUE, WORSE: ORANGE, NOT_SHOWN: "0.45"}
 OFFSET = 0.17
-"""Of the two intervals from the middle of their row."""
+"""From the middle of a row to its two intervals."""
 
 
 def draw_effects(report: Report) -> Figure:
-    """Draw a panel a metric and in it a line a row: its difference from the reference and both intervals.
+    """Draw one panel per metric, in it one line per row: its difference from the reference and both intervals.
 
     Args:
         report: with at least one row that was paired with the reference.
     """
     rows = [row for row in report.rows if row.contrasts]
-    names = [name for name in METRICS if name in report.metrics]
-    names += [name for name in report.metrics if name.startswith(("edge", "si_"))][:1]
+    names = [*metric_names("headline", among=report.metrics), *metric_names("edge", among=report.metrics)[:1]]
     height = 1.35 + len(rows) * max(0.2, min(0.36, 14 / len(rows)))
     figure = Figure(figsize=(2.4 + 2.5 * len(names), height), dpi=130, layout="constrained")
-    figure.suptitle(f"difference from {_short(report.reference.label)}", fontsize=11)
+    figure.suptitle(f"difference from {shorten(report.reference.label)}", fontsize=11)
     axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for name, axis in zip(names, axes, strict=True):
         _panel(axis, rows, name)
-    axes[0].set_yticks(range(len(rows)), [_short(row.label) for row in rows], fontsize=9)
+    axes[0].set_yticks(range(len(rows)), [shorten(row.label) for row in rows], fontsize=9)
     axes[0].set_ylim(len(rows) - 0.45, -0.55)
     figure.legend(handles=_legend(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     return figure
-
-
-def save_effects(path: Path, report: Report) -> None:
-    """Write :func:`draw_effects` as a PNG file, whole or not at all."""
-    save_figure(path, draw_effects(report))
 
 
 def _panel(axis: Axes, rows: Sequence[Row], name: str) -> None:
@@ -69,20 +58,18 @@ def _panel(axis: Axes, rows: Sequence[Row], name: str) -> None:
 
 
 def _finish(axis: Axes, name: str) -> None:
-    unit = f" [{UNITS[name]}]" if name in UNITS else ""
-    axis.set_title(name + unit, fontsize=10)
-    axis.set_xlabel("better →" if higher_is_better(name) else "← better", fontsize=9)
+    axis.set_title(metric_info(name).label, fontsize=10)
+    axis.set_xlabel("better →" if metric_info(name).higher_is_better else "← better", fontsize=9)
     axis.tick_params(axis="x", labelsize=8)
     axis.locator_params(axis="x", nbins=5)
     axis.tick_params(axis="y", length=0)
     axis.grid(axis="x", alpha=0.25)
     axis.set_axisbelow(True)
-    for side in ("top", "right", "left"):
-        axis.spines[side].set_visible(False)
+    strip_frame(axis, "top", "right", "left")
 
 
 def _bars(axis: Axes, bars: Sequence[tuple[float, Interval, str]], *, thick: bool) -> None:
-    """Draw intervals, all at once; where a thin one leaves the plot, an arrow says so."""
+    """Draw intervals, all at once; an arrow marks where a thin one leaves the plot."""
     left, right = axis.get_xlim()
     seen = [bar for bar in bars if bar[1].known and bar[1].high >= left and bar[1].low <= right]
     places, colours = [place for place, _, _ in seen], [colour for _, _, colour in seen]
@@ -100,7 +87,7 @@ def _bars(axis: Axes, bars: Sequence[tuple[float, Interval, str]], *, thick: boo
 
 
 def _beyond(axis: Axes, value: float, place: float, colour: str) -> None:
-    """Write down a difference that lies outside the plot."""
+    """Write a difference that lies outside the plot at its edge."""
     left, right = axis.get_xlim()
     text, x, side = (f"{value:+.3f} →", right, "right") if value > right else (f"← {value:+.3f}", left, "left")
     box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
@@ -120,13 +107,8 @@ def _limits(found: Sequence[Contrast]) -> tuple[float, float]:
 
 
 def _legend() -> list[Line2D]:
-    words = [Line2D([], [], color=colour, marker="o", linewidth=0, label=word) for word, colour in COLOURS.items()]
     return [
-        *words,
+        *(Line2D([], [], color=colour, marker="o", linewidth=0, label=word) for word, colour in COLOURS.items()),
         Line2D([], [], color="0.45", linewidth=5, alpha=0.45, label="95 % over scenes"),
         Line2D([], [], color="0.45", linewidth=1.2, marker="|", label="95 % over seeds"),
     ]
-
-
-def _short(label: str) -> str:
-    return label if len(label) <= LONGEST else f"{label[: LONGEST - 1]}…"

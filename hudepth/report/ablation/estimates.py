@@ -1,12 +1,12 @@
-"""Means over seeds, differences between rows, and how sure both are.
+"""Means over seeds, differences between rows, and the uncertainty of both.
 
-Two things could have come out otherwise, and each has an interval of its own:
+There are two sources of uncertainty, with an interval each:
 
     seeds    another seed gives another network: Student's t over the seeds' values, or over their paired differences
     scenes   another test set has other scenes: bootstrap of the mean over the seeds, every seed with the same draws
 
-A difference is shown only if both intervals, where there are both, leave out 0. They are 95 % intervals of one metric
-and one row each: among many rows some differ by chance.
+A difference is shown only if every interval there is excludes 0. These are 95 % intervals of one metric and one row
+each: among many rows some differ by chance.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hudepth.metrics.bootstrap import LEVEL, Draws, interval_of
+from hudepth.metrics.catalogue import metric_info
 from hudepth.metrics.student import student_quantile
-from hudepth.metrics.summary import higher_is_better
 
 BETTER, WORSE, NOT_SHOWN = "better", "worse", "not shown"
 
@@ -120,11 +120,11 @@ def contrast(
 
 
 def verdict(name: str, value: float, seeds: Interval, scenes: Interval) -> str:
-    """Say what a difference shows: better or worse only if every interval that there is leaves out 0."""
+    """Return what a difference shows: better or worse only if every interval there is excludes 0."""
     known = [interval for interval in (seeds, scenes) if interval.known]
     if not known or not all(interval.excludes_zero for interval in known):
         return NOT_SHOWN
-    return BETTER if (value > 0) == higher_is_better(name) else WORSE
+    return BETTER if (value > 0) == metric_info(name).higher_is_better else WORSE
 
 
 def _mean(values: Sequence[float]) -> float:

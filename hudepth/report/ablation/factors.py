@@ -1,4 +1,4 @@
-"""What was varied in a sweep, found from the configurations of its rows and not from what was typed."""
+"""What a sweep varies, found from the configurations of its rows and not from its command line."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from typing import Any
 
 from hudepth.runs.identity import identity
 from hudepth.runs.sweeps import SEEDS
+from hudepth.viz.style import shorten
 
 TARGET = "_target_"
 ABSENT = "-"
-"""Shown where a row's configuration has no such key."""
+"""Of a row whose configuration has no such key."""
 LONGEST = 40
-"""Letters of a value that are shown."""
+"""Letters of a formatted value."""
 
 
 @dataclass(frozen=True)
 class Factor:
-    """One thing that was varied."""
+    """One thing that varies."""
 
     key: str
     """Dotted, as in config.yaml; that of a class ends in ``_target_``."""
@@ -29,81 +30,80 @@ class Factor:
     values: list[Any]
     """A value for each row; None both for null and for rows without the key."""
     shown: list[str]
-    """The same in letters."""
+    """The same, formatted."""
 
 
 def variant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what repetitions of one configuration share: its identity without :data:`hudepth.runs.sweeps.SEEDS`."""
+    """Return what repetitions of one configuration share: its identity without the seeds."""
     return {key: value for key, value in identity(config).items() if key not in SEEDS}
 
 
 def variant_key(config: Mapping[str, Any]) -> str:
-    """Return a text that is equal for repetitions of one configuration."""
-    return json.dumps({key: spelt(value) for key, value in variant(config).items()}, sort_keys=True)
+    """Return a text that repetitions of one configuration share."""
+    return json.dumps({key: canonical(value) for key, value in variant(config).items()}, sort_keys=True)
 
 
 def seed_of(config: Mapping[str, Any]) -> str:
-    """Return in which repetition a run is: ``1``, or ``1/7`` where the data has another seed than the training."""
+    """Return which repetition a run is: ``1``, or ``1/7`` if the data has another seed than the training."""
     data = config.get("data")
     seeds = [config.get("seed"), data.get("seed") if isinstance(data, Mapping) else None]
     return "/".join(dict.fromkeys(str(seed) for seed in seeds if seed is not None)) or ABSENT
 
 
-def spelt(value: Any) -> str:
+def canonical(value: Any) -> str:
     """Return a text that is equal for equal values; 1 and 1.0 are equal, 1 and true are not."""
     if isinstance(value, bool) or value is None or isinstance(value, str):
         return json.dumps(value)
     if isinstance(value, int | float):
         return repr(float(value))
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(spelt, value))}]"
+        return f"[{','.join(map(canonical, value))}]"
     if isinstance(value, Mapping):
-        return f"{{{','.join(f'{key}:{spelt(value[key])}' for key in sorted(value, key=str))}}}"
+        return f"{{{','.join(f'{key}:{canonical(value[key])}' for key in sorted(value, key=str))}}}"
     return str(value)
 
 
 def find_factors(variants: Sequence[Mapping[str, Any]]) -> list[Factor]:
     """Return what differs between rows.
 
-    What belongs to a class that differs, like the options of one loss among several, is a factor only if it differs
-    between rows of the same class.
+    Options of a class that differs, as of one loss among several, are factors only if they differ between rows of the
+    same class.
 
     Args:
-        variants: for each row what :func:`variant` returns.
+        variants: :func:`variant` of each row.
     """
-    rows = [_whole(row, variants) for row in variants]
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    found = [key for key in keys if _varies(key, rows)]
+    rows = [_spell_out(row, variants) for row in variants]
+    found = [key for key in dict.fromkeys(key for row in rows for key in row) if _varies(key, rows)]
     names = _names(found)
     return [
         Factor(
             key,
             names[key],
             [row.get(key) for row in rows],
-            [shown(row[key], of_class=_is_target(key)) if key in row else ABSENT for row in rows],
+            [format_value(row[key], is_class=_is_target(key)) if key in row else ABSENT for row in rows],
         )
         for key in found
     ]
 
 
 def config_differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Return every key in which two variants differ, with both values in letters and in full."""
+    """Return every key in which two variants differ, with both values in full."""
     keys = dict.fromkeys([*a, *b])
     return [
         (key, _full(a[key]) if key in a else ABSENT, _full(b[key]) if key in b else ABSENT)
         for key in keys
-        if (key in a) != (key in b) or spelt(a.get(key)) != spelt(b.get(key))
+        if (key in a) != (key in b) or canonical(a.get(key)) != canonical(b.get(key))
     ]
 
 
-def shown(value: Any, *, of_class: bool = False) -> str:
-    """Return a value as a cell of a table has room for it: classes and files without where they lie."""
-    text = _full(value)
+def format_value(value: Any, *, is_class: bool = False) -> str:
+    """Return a value short enough for a table: classes without their module, files without their folder."""
     if value is None:
         return "none"
+    text = _full(value)
     if isinstance(value, str):
-        text = text.rpartition("." if of_class else "/")[2] or text
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
+        text = text.rpartition("." if is_class else "/")[2] or text
+    return shorten(text, LONGEST)
 
 
 def _full(value: Any) -> str:
@@ -118,8 +118,8 @@ def _is_target(key: str) -> bool:
     return key == TARGET or key.endswith(f".{TARGET}")
 
 
-def _whole(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Say ``early_stopping: null`` in the words of rows that have a class there: ``early_stopping._target_: null``."""
+def _spell_out(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Turn ``early_stopping: null`` into ``early_stopping._target_: null`` if other rows have a class there."""
     classes = {key.removesuffix(f".{TARGET}") for each in rows for key in each if _is_target(key)}
     return {f"{key}.{TARGET}" if key in classes else key: value for key, value in row.items()}
 
@@ -128,8 +128,8 @@ def _varies(key: str, rows: Sequence[Mapping[str, Any]]) -> bool:
     owners = _owners(key)
     values: dict[tuple[str, ...], set[str]] = {}
     for row in rows:
-        classes = tuple(spelt(row.get(owner)) for owner in owners)
-        values.setdefault(classes, set()).add(spelt(row[key]) if key in row else ABSENT)
+        classes = tuple(canonical(row.get(owner)) for owner in owners)
+        values.setdefault(classes, set()).add(canonical(row[key]) if key in row else ABSENT)
     return any(len(each) > 1 for each in values.values())
 
 

@@ -1,10 +1,10 @@
-"""A metric over the weights of the loss's terms."""
+"""A metric over the weights of the loss's terms, where a sweep forms a grid of them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,72 +13,106 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from hudepth.metrics.summary import higher_is_better
-from hudepth.report.ablation.grid import Grid
-from hudepth.report.ablation.report import UNITS
+from hudepth.metrics.catalogue import metric_info
+from hudepth.report.ablation.factors import canonical, format_value
+from hudepth.report.ablation.rows import Row
 from hudepth.viz.limits import usual_range
-from hudepth.viz.panels import save_figure
+from hudepth.viz.style import ORANGE, strip_frame
 
+WEIGHTS = ("loss.boundary", "loss.smoothness", "loss.scaling")
 EMPTY = "0.9"
 
 
-def draw_heatmap(grid: Grid, *, metric: str = "abs_rel") -> Figure:
-    """Draw a panel for each value of the third weight: the metric's mean over seeds in each cell, the best ringed.
+@dataclass(frozen=True)
+class Grid:
+    """Rows that differ in nothing but the weights."""
 
-    Args:
-        grid: of at least two weights.
-        metric: its name.
+    y: str
+    """Names of the weights: down, across, and from panel to panel; the last is empty if it does not vary."""
+    x: str
+    panel: str
+    ys: list[str]
+    """Their formatted values, lowest first."""
+    xs: list[str]
+    panels: list[str]
+    cells: dict[tuple[str, str, str], Row]
+    """By value of panel, y and x."""
+
+
+def find_grid(rows: Sequence[Row]) -> Grid | None:
+    """Return the largest grid of weights among rows; None if no two weights have two values each.
+
+    Rows that differ in something else, or lack a weight, are in no grid with the others.
     """
-    tall, wide, count = len(grid.ys), len(grid.xs), len(grid.panels)
+    groups: dict[tuple[tuple[str, str], ...], list[Row]] = {}
+    for row in rows:
+        config = row.variant.config
+        if row.runs and all(key in config for key in WEIGHTS):
+            rest = tuple((key, canonical(value)) for key, value in sorted(config.items()) if key not in WEIGHTS)
+            groups.setdefault(rest, []).append(row)
+    group = max(groups.values(), key=len, default=[])
+    values = {key: _sort_values([row.variant.config[key] for row in group]) for key in WEIGHTS}
+    varied = [key for key in WEIGHTS if len(values[key]) > 1]
+    if len(varied) < 2:
+        return None
+    y, x, *more = varied
+    panel = more[0] if more else ""
+    cells = {}
+    for row in group:
+        places = [format_value(row.variant.config[key]) if key else "" for key in (panel, y, x)]
+        cells[places[0], places[1], places[2]] = row
+    down, across, between = (key.rpartition(".")[2] for key in (y, x, panel))
+    return Grid(down, across, between, values[y], values[x], values[panel] if panel else [""], cells)
+
+
+def _sort_values(found: Sequence[Any]) -> list[str]:
+    def order(value: Any) -> tuple[bool, float, str]:
+        is_number = isinstance(value, int | float)
+        return not is_number, value if is_number else 0, str(value)
+
+    distinct = {canonical(value): value for value in found}
+    return list(dict.fromkeys(format_value(value) for value in sorted(distinct.values(), key=order)))
+
+
+def draw_heatmap(grid: Grid, *, metric: str = "abs_rel") -> Figure:
+    """Draw one panel per value of the third weight: the metric's mean over seeds in each cell, the best ringed."""
+    tall, wide, count, info = len(grid.ys), len(grid.xs), len(grid.panels), metric_info(metric)
     figure = Figure(figsize=(1.9 + count * (0.6 + 0.95 * wide), 1.5 + 0.75 * tall), dpi=130, layout="constrained")
     axes = figure.subplots(1, count, squeeze=False, sharey=True)[0]
     means = {where: row.estimates[metric].mean for where, row in grid.cells.items()}
     known = [mean for mean in means.values() if math.isfinite(mean)]
     low, high = usual_range(known)
-    best = (max if higher_is_better(metric) else min)(known, default=math.nan)
+    best = (max if info.higher_is_better else min)(known, default=math.nan)
     scale: dict[str, Any] = {"vmin": low, "vmax": high if high > low else low + 1e-3}
-    scale["cmap"] = colormaps["viridis" if higher_is_better(metric) else "viridis_r"].with_extremes(bad=EMPTY)
-    middle = (scale["vmin"] + scale["vmax"]) / 2
+    scale["cmap"] = colormaps["viridis" if info.higher_is_better else "viridis_r"].with_extremes(bad=EMPTY)
     for axis, panel in zip(axes, grid.panels, strict=True):
         values = np.array([[means.get((panel, y, x), math.nan) for x in grid.xs] for y in grid.ys])
         drawn = axis.imshow(values, aspect="auto", **scale)
-        _write(axis, values, best=best, is_light=lambda value: (value > middle) == higher_is_better(metric))
-        _label(axis, grid, panel)
+        for y, x in np.ndindex(*values.shape):
+            value = float(values[y, x])
+            is_light = (value > (scale["vmin"] + scale["vmax"]) / 2) == info.higher_is_better
+            _write(axis, x, y, value, colour="black" if is_light else "white", is_best=value == best)
+        axis.set_xticks(range(wide), grid.xs, fontsize=9)
+        axis.set_yticks(range(tall), grid.ys, fontsize=9)
+        axis.tick_params(length=0)
+        axis.set_xlabel(grid.x, fontsize=10)
+        if grid.panel:
+            axis.set_title(f"{grid.panel} = {panel}", fontsize=10)
+        strip_frame(axis, "top", "right", "bottom", "left")
     axes[0].set_ylabel(grid.y, fontsize=10)
-    extend = "max" if max(known, default=0) > high else "neither"
-    unit = f" [{UNITS[metric]}]" if metric in UNITS else ""
-    word = "higher" if higher_is_better(metric) else "lower"
-    bar = figure.colorbar(drawn, ax=list(axes), extend=extend)
-    bar.set_label(f"{metric}{unit}, {word} is better", fontsize=9)
+    bar = figure.colorbar(drawn, ax=list(axes), extend="max" if max(known, default=0) > high else "neither")
+    bar.set_label(f"{info.label}, {'higher' if info.higher_is_better else 'lower'} is better", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return figure
 
 
-def save_heatmap(path: Path, grid: Grid, *, metric: str = "abs_rel") -> None:
-    """Write :func:`draw_heatmap` as a PNG file, whole or not at all."""
-    save_figure(path, draw_heatmap(grid, metric=metric))
-
-
-def _label(axis: Axes, grid: Grid, panel: str) -> None:
-    axis.set_xticks(range(len(grid.xs)), grid.xs, fontsize=9)
-    axis.set_yticks(range(len(grid.ys)), grid.ys, fontsize=9)
-    axis.tick_params(length=0)
-    axis.set_xlabel(grid.x, fontsize=10)
-    if grid.panel:
-        axis.set_title(f"{grid.panel} = {panel}", fontsize=10)
-    for side in axis.spines.values():
-        side.set_visible(False)
-
-
-def _write(axis: Axes, values: Any, *, best: float, is_light: Callable[[float], bool]) -> None:
-    """Write each cell's number on it; a cell without a run stays empty."""
-    for y, x in np.ndindex(*values.shape):
-        value = values[y, x]
-        if not math.isfinite(value):
-            axis.text(x, y, "–", ha="center", va="center", fontsize=9, color="0.5")
-            continue
-        colour = "black" if is_light(float(value)) else "white"
-        weight = "bold" if value == best else "normal"
-        axis.text(x, y, f"{value:.4f}", ha="center", va="center", fontsize=9, color=colour, fontweight=weight)
-        if value == best:
-            axis.add_patch(Rectangle((x - 0.47, y - 0.46), 0.94, 0.92, fill=False, edgecolor="#d55e00", linewidth=2.2))
+def _write(axis: Axes, x: int, y: int, value: float, *, colour: str, is_best: bool) -> None:
+    """Write a cell's number on it; a cell without a run stays empty."""
+    if not math.isfinite(value):
+        axis.text(x, y, "–", ha="center", va="center", fontsize=9, color="0.5")
+        return
+    weight = "bold" if is_best else "normal"
+    axis.text(x, y, f"{value:.4f}", ha="center", va="center", fontsize=9, color=colour, fontweight=weight)
+    if is_best:
+        ring: dict[str, Any] = {"fill": False, "edgecolor": ORANGE, "linewidth": 2.2}
+        axis.add_patch(Rectangle((x - 0.47, y - 0.46), 0.94, 0.92, **ring))

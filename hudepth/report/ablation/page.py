@@ -1,28 +1,41 @@
-"""A report of a sweep as one page that needs nothing else: no network, no other file, no leave to run anything more."""
+"""A report of a sweep as one page that needs nothing else: no network, no other file, no further permissions."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
+from importlib.resources import files
+from string import Template
 
 from hudepth.report.ablation import words
 from hudepth.report.ablation.estimates import NOT_SHOWN
-from hudepth.report.ablation.factors import config_differences
-from hudepth.report.ablation.page_parts import SCRIPT, STYLE
+from hudepth.report.ablation.factors import ABSENT, config_differences
+from hudepth.report.ablation.pictures import Picture
 from hudepth.report.ablation.report import Report
-from hudepth.report.ablation.row import Row
+from hudepth.report.ablation.rows import Row
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture on the page."""
+class _Page(Template):
+    delimiter = "@@"  # a dollar sign means something in JavaScript
 
-    png: bytes
-    title: str
-    caption: str
+
+class Html(str):
+    """Text that is markup already and is not escaped again."""
+
+    __slots__ = ()
+
+
+def tag(name: str, *inside: str, **attributes: str | None) -> Html:
+    """Return an element; everything in it that is not :class:`Html` is escaped, attributes of None are left out.
+
+    Underscores in the names of attributes become hyphens, those at the end go: ``class_``, ``data_value``.
+    """
+    found = ((key.rstrip("_").replace("_", "-"), value) for key, value in attributes.items() if value is not None)
+    words = "".join(f' {key}="{escape(value)}"' for key, value in found)
+    return Html(f"<{name}{words}>{_join(inside)}</{name}>")
 
 
 def page(
@@ -36,86 +49,71 @@ def page(
     """Return report.html.
 
     Args:
-        report: what it says.
+        report: of the sweep.
         title: of the page.
         pictures: in their order; they become part of the page.
-        notes: a line each, of what was left alone in the folder.
-        facts: further ones, for the top of the page, like its date.
+        notes: one line for each thing in the folder that was left alone.
+        facts: further ones for the top of the page, like its date.
     """
     parts = [
         ("results", "Results", _results(report)),
         ("differences", f"Differences from {report.reference.label}", _differences(report)),
-        ("pictures", "Pictures", "".join(map(_figure, pictures))),
+        ("pictures", "Pictures", _join(map(_figure, pictures))),
         ("not-counted", "Not counted", _troubles(report)),
-        ("notes", "Notes", _list(notes)),
+        ("notes", "Notes", tag("ul", _items(notes), class_="plain") if notes else Html()),
         ("configurations", "Configurations", _configurations(report)),
     ]
     parts = [part for part in parts if part[2]]
-    links = "".join(f'<a href="#{key}">{_text(name)}</a>' for key, name, _ in parts)
-    sections = "".join(f'<section id="{key}"><h2>{_text(name)}</h2>{inside}</section>' for key, name, inside in parts)
-    return (
-        f"{_head(title)}<body><header><h1>{_text(title)}</h1>"
-        f'<p class="lead">{_text(_sentence(words.about(report)))}.</p>{_facts(report, facts or {})}'
-        f'{_warnings(report.warnings)}<nav aria-label="Parts of this page">{links}</nav></header>'
-        f'<main>{sections}</main><footer><p class="quiet">{_text(words.method(report))}</p></footer>'
-        f"<script>{SCRIPT}</script></body></html>\n"
+    notice = tag("div", tag("ul", _items(report.warnings)), class_="notice", role="note")
+    template = files(__package__).joinpath("page.html").read_text(encoding="utf-8")
+    return _Page(template).substitute(
+        policy=_policy(template),
+        title=escape(title),
+        about=escape(_sentence(words.about(report))),
+        facts=_facts(report, facts or {}),
+        warnings=notice if report.warnings else "",
+        links=_join(tag("a", name, href=f"#{key}") for key, name, _ in parts),
+        sections=_join(tag("section", tag("h2", name), inside, id=key) for key, name, inside in parts),
+        method=escape(words.method(report)),
     )
 
 
-def _head(title: str) -> str:
-    def source(text: str) -> str:
-        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-    policy = (
-        f"default-src 'none'; img-src data:; style-src {source(STYLE)}; script-src {source(SCRIPT)}; "
-        "base-uri 'none'; form-action 'none'"
-    )
-    return (
-        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="referrer" content="no-referrer"><link rel="icon" href="data:,">'
-        f"<title>{_text(title)}</title><style>{STYLE}</style></head>"
-    )
+def _policy(template: str) -> str:
+    """Allow the page's own style and script by their digests, pictures within the page, and nothing else."""
+    sources = ""
+    for kind in ("style", "script"):
+        (inside,) = re.findall(rf"<{kind}>(.*?)</{kind}>", template, flags=re.DOTALL)
+        sources += f"{kind}-src 'sha256-{base64.b64encode(hashlib.sha256(inside.encode()).digest()).decode()}'; "
+    return f"default-src 'none'; img-src data:; {sources}base-uri 'none'; form-action 'none'"
 
 
-def _text(value: str) -> str:
-    return escape(value, quote=True)
+def _join(parts: Iterable[str]) -> Html:
+    return Html("".join(part if isinstance(part, Html) else escape(part) for part in parts))
 
 
 def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _facts(report: Report, more: Mapping[str, str]) -> str:
-    shas = (str(report.first.data["fingerprint"])[:8], str(report.first.split["sha256"])[:8])
+def _items(lines: Iterable[str]) -> Html:
+    return _join(tag("li", _sentence(line)) for line in lines)
+
+
+def _facts(report: Report, more: Mapping[str, str]) -> Html:
     facts = {
         "Protocol": report.protocol,
-        "Data": f"{report.first.data['source']} ({shas[0]})",
-        "Split": f"{report.first.split['kind']} ({shas[1]})",
+        "Data": f"{report.first.data['source']} ({str(report.first.data['fingerprint'])[:8]})",
+        "Split": f"{report.first.split['kind']} ({str(report.first.split['sha256'])[:8]})",
         "Rows": f"{len(report.rows)}, {words.seeds(report)}",
         "Reference": report.reference.label,
         "hudepth": ", ".join(report.versions),
         **more,
     }
-    cells = "".join(f"<div><dt>{_text(term)}</dt><dd>{_text(text)}</dd></div>" for term, text in facts.items())
-    return f'<dl class="facts">{cells}</dl>'
+    return tag("dl", *(tag("div", tag("dt", term), tag("dd", text)) for term, text in facts.items()), class_="facts")
 
 
-def _warnings(lines: Sequence[str]) -> str:
-    return f'<div class="notice" role="note"><ul>{_items(lines)}</ul></div>' if lines else ""
-
-
-def _items(lines: Iterable[str]) -> str:
-    return "".join(f"<li>{_text(_sentence(line))}</li>" for line in lines)
-
-
-def _list(lines: Sequence[str]) -> str:
-    return f'<ul class="plain">{_items(lines)}</ul>' if lines else ""
-
-
-def _results(report: Report) -> str:
-    tools = (
+def _results(report: Report) -> Html:
+    tools = Html(
         '<div class="tools"><label for="filter">Filter rows</label>'
         '<input id="filter" type="search" autocomplete="off" placeholder="name or value">'
         '<output id="filtered" for="filter" class="quiet" aria-live="polite"></output></div>'
@@ -124,140 +122,134 @@ def _results(report: Report) -> str:
     factors = report.factors if named else []
     digits = words.places(report)
     heads = [
-        _sorter("row", "text"),
-        *(_sorter(factor.name, _kind(factor.shown)) for factor in factors),
-        _sorter("seeds", "number"),
-        *(_sorter(words.heading(name), "number") for name in report.metrics),
+        _sorter("row", is_number=False),
+        *(_sorter(factor.name, is_number=_are_numbers(factor.shown)) for factor in factors),
+        _sorter("seeds"),
+        *(_sorter(words.heading(name)) for name in report.metrics),
     ]
-    rows = "".join(_result_row(row, report, digits, with_factors=named) for row in report.rows)
+    rows = []
+    for row in report.rows:
+        cells = [
+            _factor(value, is_number=_are_numbers(factor.shown))
+            for factor, value in zip(factors, row.variant.factors if named else (), strict=True)
+        ]
+        cells.append(tag("td", row.counted, data_value=str(len(row.runs))))
+        rows.append(_row(row, [*cells, *(_result(row, name, digits[name]) for name in report.metrics)]))
     note = (
-        '<p class="quiet">Mean over seeds; ± half of the 95 % interval over seeds; below it the 95 % interval over '
-        "scenes. The best of each column is underlined. rmse in metres. Headings sort.</p>"
+        "Mean over seeds; ± half of the 95 % interval over seeds; below it the 95 % interval over scenes. The best of "
+        "each column is underlined. Click a heading to sort."
     )
-    return tools + _table(heads, rows, name="Results", classes="sortable") + note
+    return _join([tools, _table("Results", heads, rows, class_="sortable"), tag("p", note, class_="quiet")])
 
 
-def _kind(shown: Sequence[str]) -> str:
-    """Sort a factor as numbers if all its values are."""
-    try:
-        [float(value) for value in shown if value != "-"]
-    except ValueError:
-        return "text"
-    return "number"
-
-
-def _sorter(name: str, kind: str) -> str:
-    align = ' class="text"' if kind == "text" else ""
-    return f'<th scope="col" data-kind="{kind}"{align}><button type="button">{_text(name)} </button></th>'
-
-
-def _table(heads: Sequence[str], rows: str, *, name: str, classes: str = "") -> str:
-    return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{_text(name)}"><table class="{classes}">'
-        f"<thead><tr>{''.join(heads)}</tr></thead><tbody>{rows}</tbody></table></div>"
-    )
-
-
-def _row_open(row: Row) -> str:
-    searched = " ".join([row.label, *row.variant.factors]).lower()
-    tag = ' <span class="tag">reference</span>' if row.is_reference else ""
-    differs = f'<small class="caution">differs: {_text("; ".join(row.differs))}</small>' if row.differs else ""
-    label = _text(row.label).replace("_", "_<wbr>")  # a long name breaks between its words
-    head = f'<th scope="row" data-value="{_text(row.label)}">{label}{tag}{differs}</th>'
-    return f'<tr data-filter="{_text(searched)}">{head}'
-
-
-def _result_row(row: Row, report: Report, digits: Mapping[str, int], *, with_factors: bool) -> str:
-    cells = []
-    if with_factors:
-        for factor, shown in zip(report.factors, row.variant.factors, strict=True):
-            number = _kind(factor.shown) == "number"
-            value = "" if number and shown == "-" else shown
-            align = "" if number else ' class="text"'
-            cells.append(f'<td data-value="{_text(value)}"{align}>{_text(shown)}</td>')
-    cells.append(f'<td data-value="{len(row.runs)}">{_text(row.counted)}</td>')
-    for name in report.metrics:
-        found = row.estimates.get(name)
-        if found is None or found.mean != found.mean:
-            cells.append('<td data-value="">–</td>')
-            continue
-        scenes = words.between(found.scenes, digits[name])
-        small = "".join(
-            f"<small>{text}</small>" for text in (words.half_width(found.seeds, digits[name]), scenes) if text
-        )
-        best = ' class="best"' if name in row.best else ""
-        value = words.number(found.mean, digits[name])
-        cells.append(f'<td data-value="{found.mean!r}"{best}><span class="value">{value}</span>{small}</td>')
-    return f"{_row_open(row)}{''.join(cells)}</tr>"
-
-
-def _differences(report: Report) -> str:
+def _differences(report: Report) -> Html:
     rows = [row for row in report.rows if row.contrasts]
     if not rows:
-        return ""
+        return Html()
     digits = words.places(report)
-    heads = [_sorter("row", "text"), *(_sorter(words.heading(name), "number") for name in report.metrics)]
-    body = "".join(
-        f"{_row_open(row)}{''.join(_difference(row, n, digits[n]) for n in report.metrics)}</tr>" for row in rows
-    )
+    heads = [_sorter("row", is_number=False), *(_sorter(words.heading(name)) for name in report.metrics)]
+    body = [_row(row, [_difference(row, name, digits[name]) for name in report.metrics]) for row in rows]
     note = (
-        '<p class="quiet">Row minus reference, paired by seed and by image; below it the 95 % intervals over seeds and '
-        "over scenes. Better or worse: both leave out 0. Among many rows some differ by chance.</p>"
+        "Row minus reference, paired by seed and by image; below it the 95 % intervals over seeds and over scenes. "
+        "Better or worse: both exclude 0. Among many rows some differ by chance."
     )
-    return _table(heads, body, name="Differences", classes="sortable") + note
+    return _join([_table("Differences", heads, body, class_="sortable"), tag("p", note, class_="quiet")])
 
 
-def _difference(row: Row, name: str, digits: int) -> str:
+def _are_numbers(shown: Sequence[str]) -> bool:
+    try:
+        return bool([float(value) for value in shown if value != ABSENT])
+    except ValueError:
+        return False
+
+
+def _sorter(name: str, *, is_number: bool = True) -> Html:
+    kind, align = ("number", None) if is_number else ("text", "text")
+    return tag("th", tag("button", f"{name} ", type="button"), scope="col", data_kind=kind, class_=align)
+
+
+def _table(name: str, heads: Sequence[str], rows: Sequence[str], *, class_: str | None = None) -> Html:
+    table = tag("table", tag("thead", tag("tr", *heads)), tag("tbody", *rows), class_=class_)
+    return tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=name)
+
+
+def _row(row: Row, cells: Sequence[str]) -> Html:
+    label = Html(escape(row.label).replace("_", "_<wbr>"))  # a long name breaks between its words
+    reference = [Html(" "), tag("span", "reference", class_="tag")] if row.is_reference else []
+    differs = [tag("small", f"differs: {'; '.join(row.differs)}", class_="caution")] if row.differs else []
+    head = tag("th", label, *reference, *differs, scope="row", data_value=row.label)
+    return tag("tr", head, *cells, data_filter=" ".join([row.label, *row.variant.factors]).lower())
+
+
+def _factor(value: str, *, is_number: bool) -> Html:
+    sorted_by = "" if is_number and value == ABSENT else value
+    return tag("td", value, data_value=sorted_by, class_=None if is_number else "text")
+
+
+def _result(row: Row, name: str, digits: int) -> Html:
+    found = row.estimates.get(name)
+    if found is None or found.mean != found.mean:
+        return tag("td", "–", data_value="")
+    texts = (words.half_width(found.seeds, digits), words.between(found.scenes, digits))
+    value = tag("span", words.number(found.mean, digits), class_="value")
+    best = "best" if name in row.best else None
+    return tag("td", value, *(tag("small", x) for x in texts if x), data_value=repr(found.mean), class_=best)
+
+
+def _difference(row: Row, name: str, digits: int) -> Html:
     found = row.contrasts.get(name)
     if found is None or found.value != found.value:
-        return '<td data-value="">–</td>'
-    seeds, scenes = (words.between(each, digits, sign=True) for each in (found.seeds, found.scenes))
-    arrow = "" if found.verdict == NOT_SHOWN else " ▲" if (found.value > 0) else " ▼"
-    alone = words.rests_on(found)
-    word = found.verdict + (f", {alone}" if alone and found.verdict != NOT_SHOWN else "")
-    small = f'<small class="word">{word}</small>' + "".join(
-        f"<small>{what} {text}</small>" for what, text in (("seeds", seeds), ("scenes", scenes)) if text
-    )
-    kind = "" if found.verdict == NOT_SHOWN else f' class="{found.verdict}"'
-    value = words.number(found.value, digits, sign=True)
-    return f'<td data-value="{found.value!r}"{kind}><span class="value">{value}{arrow}</span>{small}</td>'
+        return tag("td", "–", data_value="")
+    is_shown, alone = found.verdict != NOT_SHOWN, words.rests_on(found)
+    arrow = (" ▲" if found.value > 0 else " ▼") if is_shown else ""
+    value = tag("span", f"{words.number(found.value, digits, sign=True)}{arrow}", class_="value")
+    word = tag("small", f"{found.verdict}, {alone}" if alone and is_shown else found.verdict, class_="word")
+    ends = (("seeds", found.seeds), ("scenes", found.scenes))
+    small = (tag("small", f"{what} {words.between(each, digits, sign=True)}") for what, each in ends if each.known)
+    kind = found.verdict if is_shown else None
+    return tag("td", value, word, *small, data_value=repr(found.value), class_=kind)
 
 
-def _figure(picture: Picture) -> str:
-    data = base64.b64encode(picture.png).decode()
-    return (
-        f'<figure><div class="wide"><img src="data:image/png;base64,{data}" alt="{_text(picture.title)}"></div>'
-        f"<figcaption><strong>{_text(picture.title)}.</strong> {_text(picture.caption)}</figcaption></figure>"
-    )
+def _figure(picture: Picture) -> Html:
+    source = f"data:image/png;base64,{base64.b64encode(picture.png).decode()}"
+    image = Html(f'<img src="{source}" alt="{escape(picture.title)}">')
+    caption = tag("figcaption", tag("strong", f"{picture.title}."), f" {picture.caption}")
+    return tag("figure", tag("div", image, class_="wide"), caption)
 
 
-def _troubles(report: Report) -> str:
-    if not report.troubles:
-        return ""
-    heads = [f'<th scope="col" class="text flat">{name}</th>' for name in ("run", "row", "seed", "state", "why")]
-    rows = "".join(
-        f'<tr><th scope="row">{_text(each.run or "-")}</th><td class="text">{_text(each.row)}</td>'
-        f'<td class="text">{_text(each.seed)}</td><td class="text">{_text(each.state)}</td>'
-        f'<td class="text long">{_text(each.why or "-")}</td></tr>'
+def _heads(*names: str) -> list[Html]:
+    return [tag("th", name, scope="col", class_="text flat") for name in names]
+
+
+def _troubles(report: Report) -> Html:
+    rows = [
+        tag(
+            "tr",
+            tag("th", each.run or "-", scope="row"),
+            *(tag("td", text, class_="text") for text in (each.row, each.seed, each.state)),
+            tag("td", each.why or "-", class_="text long"),
+        )
         for each in report.troubles
-    )
-    return _table(heads, rows, name="Runs that are in no mean")
+    ]
+    return _table("Runs that are in no mean", _heads("run", "row", "seed", "state", "why"), rows) if rows else Html()
 
 
-def _configurations(report: Report) -> str:
-    heads = [f'<th scope="col" class="text flat">{name}</th>' for name in ("key", "reference", "this row")]
+def _configurations(report: Report) -> Html:
     parts = []
     for row in report.rows:
         if row is report.reference:
             continue
         changes = config_differences(report.reference.variant.config, row.variant.config)
-        lines = "".join(
-            f'<tr><th scope="row"><code>{_text(key)}</code></th><td class="text long"><code>{_text(before)}</code></td>'
-            f'<td class="text long"><code>{_text(after)}</code></td></tr>'
-            for key, before, after in changes
-        )
+        lines = [
+            tag("tr", tag("th", tag("code", key), scope="row"), *(_long(value) for value in values))
+            for key, *values in changes
+        ]
         count = f"{len(changes)} key{'s' * (len(changes) != 1)} differ{'s' * (len(changes) == 1)}"
-        inside = _table(heads, lines, name=f"Configuration of {row.label}")
-        parts.append(f"<details><summary>{_text(row.label)}: {count}</summary>{inside}</details>")
-    lead = f"In what each row differs from {report.reference.label}, seeds, names and places aside."
-    return f'<p class="quiet">{_text(lead)}</p>{"".join(parts)}' if parts else ""
+        table = _table(f"Configuration of {row.label}", _heads("key", "reference", "this row"), lines)
+        parts.append(tag("details", tag("summary", f"{row.label}: {count}"), table))
+    lead = f"How each row differs from {report.reference.label}, apart from seeds, names and paths."
+    return _join([tag("p", lead, class_="quiet"), *parts]) if parts else Html()
+
+
+def _long(value: str) -> Html:
+    return tag("td", tag("code", value), class_="text long")

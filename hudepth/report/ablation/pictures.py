@@ -1,38 +1,49 @@
-"""The pictures of a sweep's report, those that there is something to show in."""
+"""The pictures of a sweep's report: each is drawn if the sweep has something to show in it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from hudepth.base.console import log
 from hudepth.base.errors import HudepthError
-from hudepth.base.options import whole_number
-from hudepth.report.ablation.effects import save_effects
-from hudepth.report.ablation.grid import find_grid
-from hudepth.report.ablation.heatmap import save_heatmap
-from hudepth.report.ablation.page import Picture
+from hudepth.report.ablation.effects import draw_effects
+from hudepth.report.ablation.heatmap import draw_heatmap, find_grid
 from hudepth.report.ablation.report import Report
-from hudepth.report.ablation.row import Row
-from hudepth.report.ablation.variants import save_variants
+from hudepth.report.ablation.rows import Row
+from hudepth.report.ablation.variants import draw_variants
 from hudepth.report.compare import tested_on_training_data
 from hudepth.runs.history import read_history
 from hudepth.runs.run_dir import BEST, CHECKPOINTS, LAST
+from hudepth.viz.panels import save_figure
 
-IMAGES = 4
-"""Most columns of panels.png."""
-NETWORKS = 12
-"""Most networks in panels.png."""
-COLOURED = 8
-"""Most lines with a colour in curves.png, if there are more than :data:`NAMED`."""
-NAMED = 16
+IMAGES, NETWORKS = 4, 12
+"""Most columns and most networks in panels.png."""
+NAMED, COLOURED = 16, 8
+"""Lines with a colour in curves.png: up to 16 rows all of them, else 8."""
 BY = "abs_rel"
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A picture on the page."""
+
+    png: bytes
+    title: str
+    caption: str
+
+
+Drawn = tuple[Figure, str, str] | None
+"""Figure, title and caption; None if there is nothing to show."""
+
+
 def draw_pictures(report: Report, folder: Path, *, config: Mapping[str, Any]) -> list[Picture]:
-    """Draw what there is to show; a picture of an earlier report that is not drawn this time is taken away.
+    """Draw what there is to show; a picture of an earlier report that is not drawn this time is removed.
 
     Args:
         report: of the sweep.
@@ -42,33 +53,30 @@ def draw_pictures(report: Report, folder: Path, *, config: Mapping[str, Any]) ->
     Raises:
         OSError: if a file cannot be written.
     """
-    drawn = []
+    pictures = []
     for name, draw in DRAWN.items():
         path = folder / f"{name}.png"
-        found = draw(report, path, config)
+        found = draw(report, config)
         if found is None:
             path.unlink(missing_ok=True)
         else:
-            drawn.append(Picture(path.read_bytes(), *found))
-    return drawn
+            save_figure(path, found[0])
+            pictures.append(Picture(path.read_bytes(), *found[1:]))
+    return pictures
 
 
-Said = tuple[str, str] | None
-"""Title and caption of a picture; None if there is none."""
-
-
-def _effects(report: Report, path: Path, _config: Mapping[str, Any]) -> Said:
+def _effects(report: Report, _config: Mapping[str, Any]) -> Drawn:
     if not any(row.contrasts for row in report.rows):
         return None
-    save_effects(path, report)
     return (
+        draw_effects(report),
         f"Differences from {report.reference.label}",
         "Dots: mean over the seeds that both rows have. Thick: 95 % interval over scenes; thin: over seeds. In colour: "
-        "both leave out 0. Arrows lead to what lies outside the plot.",
+        "both exclude 0. Arrows point to what lies outside the plot.",
     )
 
 
-def _curves(report: Report, path: Path, _config: Mapping[str, Any]) -> Said:
+def _curves(report: Report, _config: Mapping[str, Any]) -> Drawn:
     histories: dict[str, list[list[dict[str, float]]]] = {}
     for row in report.rows:
         for each in row.runs.values():
@@ -76,50 +84,48 @@ def _curves(report: Report, path: Path, _config: Mapping[str, Any]) -> Said:
                 histories.setdefault(row.label, []).append(read_history(each.run.path / "metrics.csv"))
             except HudepthError as error:
                 log.warning("not in curves.png: %s", error)
-    if not any(key.startswith("val/") for runs in histories.values() for run in runs for rows in run for key in rows):
+    histories = {label: runs for label, runs in histories.items() if runs}
+    if not any(key.startswith("val/") for runs in histories.values() for run in runs for row in run for key in row):
         return None
-    order = by_accuracy(report)
-    labels = [row.label for row in order] if len(order) > NAMED else [row.label for row in report.rows]
-    shown = list(dict.fromkeys([report.reference.label, *labels]))
+    order = sort_by_accuracy(report)
+    labels = [row.label for row in (order if len(order) > NAMED else report.rows)]
+    shown = list(dict.fromkeys([report.reference.label, *labels]))[: COLOURED if len(order) > NAMED else NAMED]
     monitor = str(next(iter(report.reference.runs.values())).run.config.get("monitor") or "")
-    save_variants(path, histories, shown=shown[: COLOURED if len(order) > NAMED else NAMED], monitor=monitor)
-    return "Validation by epoch", "Lines: mean over seeds. Bands: from the lowest to the highest seed."
+    figure = draw_variants(histories, shown=shown, monitor=monitor)
+    return figure, "Validation by epoch", "Lines: mean over seeds. Bands: from the lowest to the highest seed."
 
 
-def _heatmap(report: Report, path: Path, _config: Mapping[str, Any]) -> Said:
+def _heatmap(report: Report, _config: Mapping[str, Any]) -> Drawn:
     grid = find_grid(report.rows)
     if grid is None or BY not in report.metrics:
         return None
-    save_heatmap(path, grid, metric=BY)
-    return "Weights of the loss's terms", f"{BY}, mean over seeds; the best is ringed; grey: no finished run."
+    caption = f"{BY}, mean over seeds; the best is ringed; grey: no finished run."
+    return draw_heatmap(grid, metric=BY), "Weights of the loss terms", caption
 
 
-def _cost(report: Report, path: Path, config: Mapping[str, Any]) -> Said:
+def _cost(report: Report, config: Mapping[str, Any]) -> Drawn:
     if BY not in report.metrics or not any(f.key.startswith("model.") or f.key == "data.size" for f in report.factors):
         return None
-    from hudepth.report.ablation.networks import costs  # torch, which only some reports need
-    from hudepth.report.ablation.tradeoff import save_tradeoff
+    from hudepth.report.ablation.cost import draw_cost, find_costs  # imports torch
 
     try:
-        found = costs(report, trust=config.get("trust") or [])
+        costs = find_costs(report, metric=BY, trust=config["trust"])
     except HudepthError as error:
         log.warning("no cost.png: %s", error)
         return None
-    if not found:
+    if not costs:
         return None
-    save_tradeoff(path, found, metric=BY)
-    return (
-        "Accuracy against cost",
-        f"{BY} over parameters and over multiply-adds of one image at the run's size; bars: 95 % interval over seeds.",
-    )
+    caption = f"{BY} over parameters and multiply-adds per image at the run's size; bars: 95 % interval over seeds."
+    return draw_cost(costs, metric=BY), "Accuracy against cost", caption
 
 
-def _panels(report: Report, path: Path, config: Mapping[str, Any]) -> Said:
-    count = min(IMAGES, whole_number(config, "panels", default=IMAGES))
+def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
+    count = min(IMAGES, config["panels"])
     if not count:
         return None
-    runs = {row.label: next(iter(row.runs.values())) for row in by_accuracy(report)[:NETWORKS]}
-    runs = {row.label: runs[row.label] for row in report.rows if row.label in runs}
+    order = sort_by_accuracy(report)
+    kept = {row.label for row in order[:NETWORKS]}
+    runs = {row.label: next(iter(row.runs.values())) for row in report.rows if row.label in kept}
     usable = {
         label: each.run.path
         for label, each in runs.items()
@@ -129,23 +135,26 @@ def _panels(report: Report, path: Path, config: Mapping[str, Any]) -> Said:
     if not usable:
         log.info("no panels.png: no run has its checkpoint and was tested on the data it was trained on")
         return None
-    from hudepth.report.ablation.networks import predictions  # torch and lightning, which only this picture needs
-    from hudepth.report.ablation.sheet import save_sheet
+    from hudepth.evaluation.pictures import evenly_spaced, panels_beside  # imports torch and lightning
+    from hudepth.report.ablation.sheet import draw_sheet
 
-    found, images = predictions(usable, report.first.table.ids, count=count, config=config)
+    ids = sorted(report.first.table.ids)
+    images = [ids[place] for place in evenly_spaced(range(len(ids)), count)]
+    found = {}
+    for label, run in usable.items():
+        try:
+            found[label] = panels_beside({label: run}, images, config=config)
+        except HudepthError as error:
+            log.warning("not in panels.png: '%s': %s", label, error)
     if not found:
         log.info("no panels.png: no run could be opened")
         return None
-    save_sheet(path, found, titles=images)
-    few = (
-        f" The reference and the {NETWORKS - 1} best of {len(report.rows)} rows."
-        if len(runs) < len(by_accuracy(report))
-        else ""
-    )
-    return "Predictions", f"Test images, their truth, and the lowest finished seed of each row, on one scale.{few}"
+    few = f" The reference and the {NETWORKS - 1} best of {len(report.rows)} rows." if len(runs) < len(order) else ""
+    caption = f"Test images, their ground truth, and the lowest finished seed of each row, on one scale.{few}"
+    return draw_sheet(found, titles=images), "Predictions", caption
 
 
-def by_accuracy(report: Report) -> list[Row]:
+def sort_by_accuracy(report: Report) -> list[Row]:
     """Return the rows with a result: the reference, then the best first."""
 
     def place(row: Row) -> tuple[bool, float]:
@@ -155,7 +164,7 @@ def by_accuracy(report: Report) -> list[Row]:
     return sorted((row for row in report.rows if row.runs), key=place)
 
 
-DRAWN: dict[str, Callable[[Report, Path, Mapping[str, Any]], Said]] = {
+DRAWN: dict[str, Callable[[Report, Mapping[str, Any]], Drawn]] = {
     "effects": _effects,
     "curves": _curves,
     "heatmap": _heatmap,

@@ -1,4 +1,4 @@
-"""A sweep in numbers: for each row its metrics, and how they differ from those of the reference."""
+"""A sweep in numbers: the metrics of each row, and how they differ from those of the reference."""
 
 from __future__ import annotations
 
@@ -11,24 +11,18 @@ import numpy as np
 
 from hudepth.base.errors import HudepthError
 from hudepth.metrics.bootstrap import REPEATS, SEED, Draws, Resampler, describe
-from hudepth.metrics.summary import ImageTable, higher_is_better
+from hudepth.metrics.catalogue import metric_info, metric_names
+from hudepth.metrics.summary import ImageTable
 from hudepth.report.ablation.cautions import other_versions, undefined, unpaired, versions_of
 from hudepth.report.ablation.estimates import contrast, estimate
 from hudepth.report.ablation.factors import Factor
-from hudepth.report.ablation.row import Row, choose_reference
-from hudepth.report.ablation.runs import Rows, Trouble
+from hudepth.report.ablation.rows import Row, Rows, Trouble, choose_reference
 from hudepth.runs.results import Result, paired, stamp_differences
-
-METRICS = (
-    "abs_rel", "rmse", "log10", "ssim", "delta1", "delta2", "delta3", "edge_f1_0.25", "edge_f1_0.5", "si_boundary_f1",
-)  # fmt: skip
-"""Columns, as far as results have them."""
-UNITS = {"rmse": "m"}
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that a report of a sweep says."""
+    """Everything in the report of a sweep."""
 
     protocol: str
     metrics: list[str]
@@ -38,22 +32,22 @@ class Report:
     troubles: list[Trouble]
     warnings: list[str]
     first: Result
-    """The reference's result of its lowest seed: what the others are held against."""
+    """The reference's result of its lowest seed: what the others are compared with."""
     uncertainty: dict[str, Any]
     """See :func:`hudepth.metrics.bootstrap.describe`."""
     versions: dict[str, list[str]]
-    """Names of the runs that count by the version of hudepth that they were trained with."""
+    """Names of the runs that count, by the version of hudepth that trained them."""
 
 
 def make_report(
     rows: Rows, *, protocol: str, reference: str | None = None, repeats: int = REPEATS, seed: int = SEED
 ) -> Report:
-    """Work out a sweep's table.
+    """Compute a sweep's table.
 
     Args:
-        rows: of :func:`hudepth.report.ablation.runs.sort_runs`.
-        protocol: the results' name.
-        reference: a row by its label or by that of its ``variant``; default: the first that has a result.
+        rows: of :func:`hudepth.report.ablation.rows.sort_runs`.
+        protocol: its name.
+        reference: a row by its label or its ``variant``; default: the first that has a result.
         repeats: of the bootstrap.
         seed: of its draws.
 
@@ -68,7 +62,8 @@ def make_report(
     if reference is None and chosen is not table[0]:
         warnings.append(f"'{table[0].label}' has no result, so '{chosen.label}' is the reference")
     first = next(iter(chosen.runs.values())).result
-    metrics = [name for name in METRICS if any(name in r.result.metrics for row in table for r in row.runs.values())]
+    known = {name for row in table for each in row.runs.values() for name in each.result.metrics}
+    metrics = [*metric_names("narrow", among=known), *metric_names("edge", among=known)]
     for row in table:
         row.differs = list(dict.fromkeys(line for r in row.runs.values() for line in _differences(first, r.result)))
         if row.differs:
@@ -77,7 +72,7 @@ def make_report(
     sampler = Resampler(first.table, repeats=repeats, seed=seed)
     basis = {} if chosen.differs else _draws(chosen, first, metrics, sampler)
     for row in [chosen, *(row for row in table if row is not chosen)]:  # the others need its metrics
-        _work_out(row, chosen, basis, first, metrics, sampler)
+        _compute(row, chosen, basis, first, metrics, sampler)
     _mark_best(table, metrics)
     versions = versions_of(table)
     warnings += [*undefined(table, metrics), *unpaired(table, chosen), *other_versions(versions, chosen)]
@@ -114,7 +109,7 @@ def _draws(row: Row, first: Result, metrics: Sequence[str], sampler: Resampler) 
     return found
 
 
-def _work_out(
+def _compute(
     row: Row, reference: Row, basis: Mapping[str, Draws], first: Result, metrics: Sequence[str], sampler: Resampler
 ) -> None:
     if not row.runs:
@@ -146,7 +141,7 @@ def _own_draws(row: Row, metrics: Sequence[str], like: Resampler) -> dict[str, D
 def _mark_best(table: Sequence[Row], metrics: Sequence[str]) -> None:
     comparable = [row for row in table if row.runs and not row.differs]
     for name in metrics if len(comparable) > 1 else ():
-        sign = 1 if higher_is_better(name) else -1
+        sign = 1 if metric_info(name).higher_is_better else -1
         means = {id(row): sign * row.estimates[name].mean for row in comparable}
         top = max((mean for mean in means.values() if not math.isnan(mean)), default=math.nan)
         for row in comparable:

@@ -1,21 +1,19 @@
-"""The same images under several networks: images as columns, a row each for image, truth and every network."""
+"""The same images under several networks: one column per image, a row each for image, ground truth and networks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hudepth.viz.panels import DEPTH_COLOURS, MIN_SPAN_M, UNMEASURED_COLOUR, Panel, save_figure
+from hudepth.viz.panels import DEPTH_COLOURS, MIN_SPAN_M, UNMEASURED_COLOUR, Panel
 
 
 def draw_sheet(predictions: Mapping[str, Sequence[Panel]], *, titles: Sequence[str] = ()) -> Figure:
-    """Draw images, their truth, and what each network predicts, on one metre scale.
+    """Draw images, their ground truth, and what each network predicts, on one scale in metres.
 
     Args:
         predictions: by network, a panel for each image, the same images in the same order.
@@ -26,55 +24,36 @@ def draw_sheet(predictions: Mapping[str, Sequence[Panel]], *, titles: Sequence[s
     low, high = (float(measured.min()), float(measured.max())) if measured.size else (0.0, 1.0)
     scale: dict[str, Any] = {"vmin": low, "vmax": max(high, low + MIN_SPAN_M)}
     scale["cmap"] = colormaps[DEPTH_COLOURS].with_extremes(bad=UNMEASURED_COLOUR)
-    figure, cells, bar = _layout(
-        2 + len(predictions), len(first), aspect=first[0].image.shape[0] / first[0].image.shape[1]
-    )
-    for column, panel in enumerate(first):
-        cells[0][column].imshow(panel.image)
-        truth = cells[1][column].imshow(np.ma.masked_where(panel.truth_m <= 0, panel.truth_m), **scale)
-        if column < len(titles):
-            cells[0][column].set_title(titles[column], fontsize=9, pad=4)
-    for row, panels in zip(cells[2:], predictions.values(), strict=True):
-        for axis, panel in zip(row, panels, strict=True):
-            axis.imshow(panel.pred_m, **scale)
-    for row, label in zip(cells, ("image", "truth", *predictions), strict=True):
-        row[0].text(-0.05, 0.5, _lines(label), transform=row[0].transAxes, ha="right", va="center", fontsize=9.5)
-    figure.colorbar(truth, cax=bar, orientation="horizontal", extend="both", label="depth [m]")
+    truths = [np.ma.masked_where(panel.truth_m <= 0, panel.truth_m) for panel in first]
+    rows: dict[str, Sequence[Any]] = {"image": [panel.image for panel in first], "ground truth": truths}
+    rows |= {name: [panel.pred_m for panel in panels] for name, panels in predictions.items()}
+
+    # placed in inches: with any number of rows and columns, gaps and letters keep their size
+    cell, gap, left, top, bottom = 2.0, 0.06, 1.7, 0.32, 0.62
+    tall = cell * first[0].image.shape[0] / first[0].image.shape[1]
+    width, height = left + len(first) * (cell + gap) + 0.1, top + len(rows) * (tall + gap) + bottom
+    figure = Figure(figsize=(width, height), dpi=110)
+    for row, (label, images) in enumerate(rows.items()):
+        y = height - top - (row + 1) * tall - row * gap
+        for column, image in enumerate(images):
+            x = left + column * (cell + gap)
+            axis = figure.add_axes((x / width, y / height, cell / width, tall / height))
+            drawn = axis.imshow(image, **(scale if row else {}))
+            axis.set(xticks=[], yticks=[])
+            if row == 0 and column < len(titles):
+                axis.set_title(titles[column], fontsize=9, pad=4)
+            if column == 0:
+                where: dict[str, Any] = {"transform": axis.transAxes, "ha": "right", "va": "center", "fontsize": 9.5}
+                axis.text(-0.05, 0.5, _wrap(label), **where)
+    span = len(first) * (cell + gap) - gap - 0.4
+    bar = figure.add_axes(((left + 0.2) / width, (bottom - 0.13) / height, span / width, 0.11 / height))
+    bar.tick_params(labelsize=9)
+    figure.colorbar(drawn, cax=bar, orientation="horizontal", extend="both", label="depth [m]")
     return figure
 
 
-def save_sheet(path: Path, predictions: Mapping[str, Sequence[Panel]], *, titles: Sequence[str] = ()) -> None:
-    """Write :func:`draw_sheet` as a PNG file, whole or not at all."""
-    save_figure(path, draw_sheet(predictions, titles=titles))
-
-
-def _layout(rows: int, columns: int, *, aspect: float) -> tuple[Figure, list[list[Axes]], Axes]:
-    """Return a figure with its cells, and below them the axes of the scale; placed in inches, as panels are."""
-    cell, gap, left, top, bottom = 2.0, 0.06, 1.7, 0.32, 0.62
-    width = left + columns * (cell + gap) + 0.1
-    height = top + rows * (cell * aspect + gap) + bottom
-    figure = Figure(figsize=(width, height), dpi=110)
-
-    def axes(x: float, y: float, w: float, h: float) -> Axes:
-        return figure.add_axes((x / width, y / height, w / width, h / height))
-
-    cells = [
-        [
-            axes(left + c * (cell + gap), height - top - (r + 1) * cell * aspect - r * gap, cell, cell * aspect)
-            for c in range(columns)
-        ]
-        for r in range(rows)
-    ]
-    for axis in (axis for row in cells for axis in row):
-        axis.set_xticks([])
-        axis.set_yticks([])
-    bar = axes(left + 0.2, bottom - 0.13, columns * (cell + gap) - gap - 0.4, 0.11)
-    bar.tick_params(labelsize=9)
-    return figure, cells, bar
-
-
-def _lines(label: str, *, room: int = 17) -> str:
-    """Break a label into lines that fit beside a row."""
+def _wrap(label: str, *, room: int = 17) -> str:
+    """Break a label into at most four lines that fit next to a row."""
     lines, rest = [], label
     while len(rest) > room:
         cut = max(rest.rfind(mark, 1, room + 1) for mark in " _,-/")

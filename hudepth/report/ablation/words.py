@@ -1,19 +1,19 @@
-"""Numbers of a sweep's table in letters, the same in every form of the table."""
+"""Numbers and sentences of a sweep's table, the same in every form of it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 
-from hudepth.metrics.summary import higher_is_better
+from hudepth.metrics.catalogue import metric_info
 from hudepth.report.ablation.estimates import Contrast, Interval
-from hudepth.report.ablation.report import UNITS, Report
+from hudepth.report.ablation.report import Report
 
 MOST_PLACES = 7
 
 
 def places(report: Report) -> dict[str, int]:
-    """Return the decimals of each metric: 4, 2 for large ones, and more where the largest mean has leading zeros."""
+    """Return the decimals of each metric: 4, 2 for large ones, more if the largest mean has leading zeros."""
     return {name: _places(row.estimates[name].mean for row in report.rows if row.estimates) for name in report.metrics}
 
 
@@ -39,18 +39,18 @@ def between(interval: Interval, digits: int, *, sign: bool = False) -> str:
 
 
 def half_width(interval: Interval, digits: int) -> str:
-    """Return ``±0.01`` of an interval that lies evenly about its mean; empty if there is none."""
+    """Return ``±0.01`` for a symmetric interval; empty if there is none."""
     return f"±{number((interval.high - interval.low) / 2, digits)}" if interval.known else ""
 
 
 def heading(name: str) -> str:
     """Return a metric's name, its unit, and which way is better."""
-    unit = f" [{UNITS[name]}]" if name in UNITS else ""
-    return f"{name}{unit} {'↑' if higher_is_better(name) else '↓'}"
+    info = metric_info(name)
+    return f"{info.label} {info.arrow}"
 
 
 def rests_on(contrast: Contrast) -> str:
-    """Return what a verdict rests on if that is not both intervals: ``scenes alone``, for example of one seed."""
+    """Return what a verdict rests on if that is not both intervals: ``scenes alone`` for one seed."""
     if contrast.seeds.known and contrast.scenes.known:
         return ""
     return "scenes alone" if contrast.scenes.known else "seeds alone" if contrast.seeds.known else "nothing"
@@ -72,10 +72,10 @@ def seeds(report: Report) -> str:
 
 
 def method(report: Report) -> str:
-    """Return how intervals were made, and what a verdict needs."""
+    """Return how the intervals were computed, and when a difference is called better or worse."""
     return (
         "95 % intervals, each metric and row by itself: over seeds by Student's t, over scenes by an expanded "
         f"percentile bootstrap of the mean over seeds ({report.uncertainty['repeats']} draws, the same for all rows). "
-        f"Differences from {report.reference.label} are paired by seed and by image; better or worse: both intervals, "
-        "where there are both, leave out 0."
+        f"Differences from {report.reference.label} are paired by seed and by image. Better or worse: every interval "
+        "there is excludes 0."
     )

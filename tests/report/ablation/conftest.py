@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hudepth.report.ablation.report import Report, make_report
-from hudepth.report.ablation.runs import sort_runs
+from hudepth.report.ablation.rows import sort_runs
 from hudepth.runs.sweeps import Sweep, read_sweep
 from tests.report.ablation.synthetic import image_table, make_run, make_sweep
 

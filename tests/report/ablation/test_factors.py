@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.report.ablation.factors import (
+    canonical,
     config_differences,
     find_factors,
+    format_value,
     seed_of,
-    shown,
-    spelt,
     variant,
     variant_key,
 )
@@ -95,7 +95,7 @@ def test_differences_are_complete() -> None:
     ],
 )
 def test_values_in_letters(value: Any, text: str) -> None:
-    assert shown(value) == text
+    assert format_value(value) == text
 
 
 @pytest.mark.parametrize(("seeds", "text"), [((1, 1), "1"), ((1, 2), "1/2"), ((None, None), "-"), ((0, None), "0")])
@@ -114,7 +114,7 @@ def test_equal_values_are_spelt_equally(a: Any, b: Any) -> None:
     def typed(value: Any) -> Any:
         return [typed(x) for x in value] if isinstance(value, list) else (type(value), value)
 
-    assert (spelt(a) == spelt(b)) == (typed(a) == typed(b))
+    assert (canonical(a) == canonical(b)) == (typed(a) == typed(b))
 
 
 @given(order=st.permutations(range(4)))

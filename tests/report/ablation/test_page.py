@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from hudepth.report.ablation.page import Picture, page
+from hudepth.report.ablation.page import page
+from hudepth.report.ablation.pictures import Picture
 from hudepth.report.ablation.report import Report
 
 PNG = base64.b64decode(

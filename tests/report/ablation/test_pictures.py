@@ -14,16 +14,15 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from hudepth.report.ablation.cost import Cost, draw_cost
 from hudepth.report.ablation.effects import COLOURS, draw_effects
 from hudepth.report.ablation.estimates import Estimate, Interval
-from hudepth.report.ablation.grid import find_grid
-from hudepth.report.ablation.heatmap import draw_heatmap
+from hudepth.report.ablation.heatmap import draw_heatmap, find_grid
 from hudepth.report.ablation.report import Report
-from hudepth.report.ablation.sheet import draw_sheet, save_sheet
-from hudepth.report.ablation.tradeoff import Cost, draw_tradeoff
+from hudepth.report.ablation.sheet import draw_sheet
 from hudepth.report.ablation.variants import band, draw_variants
 from hudepth.viz.limits import usual_range
-from hudepth.viz.panels import Panel
+from hudepth.viz.panels import Panel, save_figure
 
 
 def rendered(figure: Figure) -> Any:
@@ -117,13 +116,13 @@ def test_cost_has_a_point_a_row_and_keeps_those_far_out_in_sight() -> None:
             label, 2_000_000, 3_000_000_000, Estimate({"1": mean}, mean, Interval(mean - 0.01, mean + 0.01), Interval())
         )
 
-    figure = draw_tradeoff([cost("a", 0.2), cost("b", 0.21), cost("c", 0.22), cost("d", 4.0)])
+    figure = draw_cost([cost("a", 0.2), cost("b", 0.21), cost("c", 0.22), cost("d", 4.0)])
     rendered(figure)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b", "c", "d"]
     assert [text.get_text() for text in figure.axes[0].texts] == ["4.000"]
     assert [axis.get_xlabel() for axis in figure.axes] == [
         "parameters [millions]",
-        "multiply-adds of an image [billions]",
+        "multiply-adds per image [billions]",
     ]
 
 
@@ -143,11 +142,11 @@ def test_the_sheet_has_a_row_for_image_truth_and_each_network_on_one_scale() -> 
     scales = {axis.images[0].get_clim() for axis in cells[3:]}
     assert len(scales) == 1
     words = [text for axis in cells for text in axis.texts]
-    assert [text.get_text().replace("\n", "") for text in words] == ["image", "truth", "paper", name]
+    assert [text.get_text().replace("\n", "") for text in words] == ["image", "ground truth", "paper", name]
     assert min(text.get_window_extent(box).x0 for text in words) >= 0
 
 
 def test_a_sheet_without_any_truth_is_drawn_all_the_same(tmp_path: Path) -> None:
     unmeasured = [replace(panel, truth_m=np.zeros_like(panel.truth_m)) for panel in panels(1)]
-    save_sheet(tmp_path / "panels.png", {"x": unmeasured})
+    save_figure(tmp_path / "panels.png", draw_sheet({"x": unmeasured}))
     assert (tmp_path / "panels.png").read_bytes().startswith(b"\x89PNG")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.report.ablation.report import Report, make_report
-from hudepth.report.ablation.runs import in_order, sort_runs
+from hudepth.report.ablation.rows import sort_runs, sort_seeds
 from hudepth.runs.results import find_result
 from hudepth.runs.sweeps import read_sweep
 from tests.report.ablation.synthetic import image_table, make_run, make_sweep, write_sweep, write_test
@@ -278,4 +278,4 @@ def test_an_undefined_metric_is_said(sweep: Path) -> None:
 
 
 def test_seeds_are_in_the_order_of_numbers() -> None:
-    assert in_order(["10", "9", "x", "2/1", "2", "9"]) == ["2", "2/1", "9", "10", "x"]
+    assert sort_seeds(["10", "9", "x", "2/1", "2", "9"]) == ["2", "2/1", "9", "10", "x"]

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from hudepth.base.errors import HudepthError
+from hudepth.base.errors import ConfigError, DataError, HudepthError, did_you_mean
+from hudepth.report.ablation.estimates import Contrast, Estimate
 from hudepth.report.ablation.factors import ABSENT, Factor, find_factors, seed_of, variant, variant_key
 from hudepth.runs.results import Result, find_result
 from hudepth.runs.sweeps import FINISHED, Sweep, SweepRun
@@ -20,10 +21,10 @@ NO_RESULT, REPEATED, NOT_COMPOSED = "no result", "repeated", "not composed"
 
 @dataclass(frozen=True)
 class Trouble:
-    """A run, or what should have become one, that is in no mean."""
+    """A run, or a job that never became one, that is in no mean."""
 
     run: str
-    """Its folder's name; empty if it never had one."""
+    """Name of its folder; empty if it never had one."""
     row: str
     seed: str
     state: str
@@ -42,19 +43,50 @@ class Repetition:
 
 @dataclass
 class Variant:
-    """A row: runs of one configuration."""
+    """The runs of one configuration."""
 
     config: dict[str, Any]
     """By dotted key, without seeds; see :func:`hudepth.report.ablation.factors.variant`."""
     named: str
-    """By the label ``variant``; empty if there is none."""
+    """The label ``variant``; empty if there is none."""
     label: str = ""
     factors: list[str] = field(default_factory=list)
-    """A value in letters for each factor of the table."""
+    """A formatted value for each factor of the table."""
     runs: dict[str, Repetition] = field(default_factory=dict)
     """Those that count, by seed, lowest first."""
     seeds: list[str] = field(default_factory=list)
     """All that were tried, lowest first."""
+
+
+@dataclass
+class Row:
+    """A row of the table: a variant and its metrics."""
+
+    variant: Variant
+    is_reference: bool = False
+    differs: list[str] = field(default_factory=list)
+    """How its protocol, data or split differ from those of the reference."""
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    contrasts: dict[str, Contrast] = field(default_factory=dict)
+    """Empty for the reference and for rows that cannot be paired with it."""
+    best: set[str] = field(default_factory=set)
+    """Metrics in which no comparable row is better."""
+
+    @property
+    def label(self) -> str:
+        """The row's name."""
+        return self.variant.label
+
+    @property
+    def runs(self) -> dict[str, Repetition]:
+        """Runs that count, by seed."""
+        return self.variant.runs
+
+    @property
+    def counted(self) -> str:
+        """``3`` if all seeds that were tried count, else ``2 of 3``."""
+        done, tried = len(self.runs), len(self.variant.seeds)
+        return str(done) if done == tried else f"{done} of {tried}"
 
 
 @dataclass(frozen=True)
@@ -70,8 +102,8 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[SweepRun]], 
     """Read the results of a sweep's runs and sort them into rows, in the order of the sweep.
 
     Args:
-        sweep: as read.
-        protocol: whose results to read.
+        sweep: its runs.
+        protocol: of the results to read.
         track: wraps the list of runs, for a progress bar.
     """
     groups: dict[str, list[tuple[SweepRun, Result | str]]] = {}
@@ -80,22 +112,52 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[SweepRun]], 
     variants = [_variant([run for run, _ in group]) for group in groups.values()]
     factors = find_factors([each.config for each in variants])
     _label(variants, factors)
-    troubles: list[Trouble] = []
-    for each, group in zip(variants, groups.values(), strict=True):
-        troubles += _fill(each, group)
-    for labels, error in sweep.uncomposed:
-        troubles.append(_never_composed(labels, error, variants))
+    troubles = [each for row, group in zip(variants, groups.values(), strict=True) for each in _fill(row, group)]
+    troubles += [_never_composed(labels, error, variants) for labels, error in sweep.uncomposed]
     return Rows(variants, factors, troubles)
 
 
-def in_order(seeds: Iterable[str]) -> list[str]:
+def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -> Row:
+    """Return the row that the others are compared with.
+
+    Args:
+        table: all rows.
+        name: a row's label, or its ``variant``; default: the first row that has a result.
+        protocol: of the results, for the message.
+
+    Raises:
+        ConfigError: if there is no such row.
+        DataError: if no row has a result.
+    """
+    usable = [row for row in table if row.runs]
+    result = f"a test result of protocol '{protocol}'"
+    if not usable:
+        raise DataError(f"no run of the sweep has finished with {result}. Wait for one, or pass protocol=<name>.")
+    if name is None:
+        return usable[0]
+    found = [row for row in table if row.label == name]
+    found = found or [row for row in table if name in (row.variant.named, *row.variant.named.split(" / "))]
+    if not found:
+        labels = [row.label for row in table]
+        known = ", ".join(f"'{label}'" for label in labels[:8]) + (f" and {len(labels) - 8} more" * (len(labels) > 8))
+        raise ConfigError(f"reference: no row '{name}'.{did_you_mean(name, labels)} There are {known}.")
+    if len(found) > 1:
+        fix = f"Pass one, as in reference='\"{found[0].label}\"'."
+        raise ConfigError(f"reference: '{name}' is {len(found)} rows. {fix}")
+    if not found[0].runs:
+        fix = f"Pass another, as in reference='\"{usable[0].label}\"'."
+        raise ConfigError(f"reference: '{name}' has no finished run with {result}. {fix}")
+    return found[0]
+
+
+def sort_seeds(seeds: Iterable[str]) -> list[str]:
     """Return seeds, each once, lowest first, numbers as numbers."""
     parts = {seed: [(not p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"/", seed)] for seed in seeds}
     return sorted(parts, key=lambda seed: parts[seed])
 
 
 def _result(run: SweepRun, protocol: str) -> Result | str:
-    """Return a finished run's result, or why there is none; the word is empty for runs that did not finish."""
+    """Return a finished run's result, or why there is none; the text is empty for runs that did not finish."""
     if run.state != FINISHED:
         return ""
     try:
@@ -106,29 +168,29 @@ def _result(run: SweepRun, protocol: str) -> Result | str:
 
 def _variant(runs: Sequence[SweepRun]) -> Variant:
     names = dict.fromkeys(run.labels[VARIANT] for run in runs if run.labels.get(VARIANT))
-    return Variant(variant(runs[0].config), " / ".join(names), seeds=in_order(seed_of(run.config) for run in runs))
+    return Variant(variant(runs[0].config), " / ".join(names), seeds=sort_seeds(seed_of(run.config) for run in runs))
 
 
 def _label(variants: Sequence[Variant], factors: Sequence[Factor]) -> None:
-    """Name each row after its label ``variant``, and after its factors where that does not tell it apart."""
+    """Name each row after its label ``variant``, and after its factors if that is not unique."""
     times = Counter(each.named for each in variants)
     taken: Counter[str] = Counter()
     for number, each in enumerate(variants):
         each.factors = [factor.shown[number] for factor in factors]
         cells = zip(factors, each.factors, strict=True)
         words = [f"{factor.name}={cell}" for factor, cell in cells if cell != ABSENT]
-        if each.named and times[each.named] == 1:
-            words = []
-        label = ", ".join([each.named, *words] if each.named else words) or "all runs"
+        if each.named:
+            words = [each.named] if times[each.named] == 1 else [each.named, *words]
+        label = ", ".join(words) or "all runs"
         taken[label] += 1
-        each.label = label if taken[label] == 1 else f"{label} #{taken[label]}"  # cut values can look alike
+        each.label = label if taken[label] == 1 else f"{label} #{taken[label]}"  # shortened values can look alike
 
 
 def _fill(row: Variant, group: Sequence[tuple[SweepRun, Result | str]]) -> list[Trouble]:
     """Give a row the runs that count; return the others."""
     group = sorted(group, key=lambda pair: pair[0].path.name)
     last = {seed_of(run.config): (run, found) for run, found in group if isinstance(found, Result)}
-    row.runs = {seed: Repetition(*last[seed]) for seed in in_order(last)}
+    row.runs = {seed: Repetition(*last[seed]) for seed in sort_seeds(last)}
     troubles = []
     for run, found in group:
         seed, state, why = seed_of(run.config), run.state, run.error
@@ -146,7 +208,7 @@ def _never_composed(labels: dict[str, str], error: str, variants: Sequence[Varia
     named, seed = labels.get(VARIANT, ""), labels.get("seed", ABSENT)
     row = next((each for each in variants if named and named in each.named.split(" / ")), None)
     if row is not None and seed != ABSENT:
-        row.seeds = in_order([*row.seeds, seed])
+        row.seeds = sort_seeds([*row.seeds, seed])
     words = [f"{key}={value}" for key, value in labels.items() if key not in (VARIANT, "seed")]
     label = row.label if row is not None else ", ".join([named, *words] if named else words)
     return Trouble("", label, seed, NOT_COMPOSED, " ".join(error.split()))

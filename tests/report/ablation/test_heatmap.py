@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from hudepth.report.ablation.grid import Grid, find_grid
+from hudepth.report.ablation.heatmap import Grid, find_grid
 from hudepth.report.ablation.report import Report
 from tests.report.ablation.conftest import worked_out
 from tests.report.ablation.synthetic import image_table, make_run

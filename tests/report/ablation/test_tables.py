@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hudepth.base.tables import escape_latex
 from hudepth.report.ablation.document import document, table_csv
-from hudepth.report.ablation.markup import table_md, table_tex, tex
 from hudepth.report.ablation.report import Report
+from hudepth.report.ablation.tables import table_md, table_tex
 from hudepth.report.ablation.words import places
 from hudepth.runs.sweeps import Sweep
 from tests.report.ablation.conftest import worked_out
@@ -86,8 +87,8 @@ def test_markdown_rows_have_one_width_and_names_cannot_break_them(report: Report
     assert widths == {3 + len(report.factors) + len(report.metrics) + 0}
     assert any(line.startswith("| si&#124;log & &lt;b> |") for line in lines)
     assert "Difference from paper:" in lines
-    assert any(re.match(r"\| no\\_scale \| .* (better|worse|not shown) \|", line) for line in lines)
-    assert "- not counted: z\\_failed, seed 4: failed: loss is &lt;nan> & more" in lines
+    assert any(re.match(r"\| no_scale \| .* (better|worse|not shown) \|", line) for line in lines)
+    assert "- not counted: z_failed, seed 4: failed: loss is &lt;nan> & more" in lines
 
 
 def structure(text: str) -> list[str]:
@@ -128,7 +129,7 @@ def test_the_latex_table_has_the_structure_of_one(report: Report) -> None:
         "24 test images (8 scenes)",
         "official split",
         "3 seeds",
-        "rmse in metres",
+        "rmse [m]",
         "Student",
         "bootstrap",
     ):
@@ -139,7 +140,7 @@ def test_the_latex_table_has_the_structure_of_one(report: Report) -> None:
 
 @given(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20))
 def test_any_name_is_escaped_for_latex(name: str) -> None:
-    escaped = tex(name)
+    escaped = escape_latex(name)
     without = re.sub(r"\\text[a-z]+\{\}|\\[&%$#_{}]", "", escaped)
     assert not re.search(r"[\\&%$#_{}~^<>]", without)
 
@@ -158,7 +159,7 @@ def test_rows_of_other_conditions_carry_a_dagger(tmp_path: Path) -> None:
     make_run(tmp_path / "b", changes={"optim.lr": 1}, table=image_table(), document={"protocol.crop": None})
     report = worked_out(tmp_path)
     assert "lr=1 †" in table_md(report)
-    assert r"lr=1\textsuperscript{\dag} & 1 &" in table_tex(report)
+    assert r"lr=1 \textsuperscript{\dag} & 1 &" in table_tex(report)
     assert structure(table_tex(report))
 
 
