@@ -1,20 +1,23 @@
 """How stored depth values become metres, and the check that the result is plausible.
 
-Numpy only, as are the sources: worker processes import this module and must not pay for torch.
+Like the sources, this module does not import torch: worker processes import it and should start fast.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.errors import DataError
+from hudepth.base.options import Choice, convert
 
 ENCODINGS = ("auto", "uint16_mm", "uint8_10m", "float_m", "linear", "paper_literal")
-"""What ``data.encoding`` can be; :func:`to_metres` says what each means."""
+"""Values of ``data.encoding``; :func:`to_metres` explains them."""
+Encoding = Annotated[str, Choice(ENCODINGS)]
+"""One of :data:`ENCODINGS`, as the type of an option."""
 
 INDOOR_MEDIAN_M = (0.3, 20.0)
 """Median depths [m] an indoor set can have; a wrong unit lands far outside."""
@@ -26,29 +29,12 @@ _ADVICE_8BIT = (
 
 
 class DepthRange(NamedTuple):
-    """What :func:`check_range` measured over the depths it was given."""
+    """Measured depths of a sample [m], and the share of pixels that are measured, in (0, 1]."""
 
     min_m: float
-    """Smallest measured depth [m]."""
     median_m: float
-    """Median of the measured depths [m]."""
     max_m: float
-    """Largest measured depth [m]."""
     valid_fraction: float
-    """Share of pixels that are measured, in (0, 1]."""
-
-
-def check_encoding(encoding: str) -> None:
-    """Accept a name from :data:`ENCODINGS`.
-
-    Raises:
-        ConfigError: for any other name.
-    """
-    if encoding not in ENCODINGS:
-        raise ConfigError(
-            f"data.encoding: no encoding '{encoding}'.{did_you_mean(encoding, ENCODINGS)} "
-            f"Choose one of {', '.join(ENCODINGS)}."
-        )
 
 
 def resolve_encoding(
@@ -59,27 +45,25 @@ def resolve_encoding(
     Args:
         encoding: one of :data:`ENCODINGS`.
         dtype: of the stored values.
-        has_scale: whether the record brings a scale of its own; if so, ``auto`` is ``linear``.
-        auto_uint8: what 8-bit values mean in this source, None where only the user can know.
+        has_scale: whether the record has a scale of its own; if so, ``auto`` is ``linear``.
+        auto_uint8: encoding of 8-bit values in this source; None if only the user can know.
         where: names the file in errors.
 
     Raises:
         ConfigError: if the name is unknown.
-        DataError: if the values do not tell their unit.
+        DataError: if the type of the values does not determine the encoding.
     """
-    check_encoding(encoding)
+    convert("data.encoding", encoding, Encoding)
     if encoding != "auto":
         return encoding
     if has_scale:
         return "linear"
-    if dtype.kind == "u" and dtype.itemsize == 2:
-        return "uint16_mm"
-    if dtype.kind == "f":
-        return "float_m"
     if dtype == np.uint8 and auto_uint8:
         return auto_uint8
+    if dtype.kind == "f" or (dtype.kind == "u" and dtype.itemsize == 2):
+        return "float_m" if dtype.kind == "f" else "uint16_mm"
     choices = "uint8_10m (value/255*10 m) or paper_literal (value/1000 m)" if dtype == np.uint8 else "uint16_mm"
-    raise DataError(f"{_at(where)}{dtype} depth does not tell its unit. Pass data.encoding={choices}.")
+    raise DataError(f"{_prefix(where)}the unit of {dtype} depth is unknown. Pass data.encoding={choices}.")
 
 
 def to_metres(
@@ -110,9 +94,9 @@ def to_metres(
     Args:
         raw: [H, W] stored values.
         encoding: one of :data:`ENCODINGS`.
-        scale_m: metres a unit of the stored value, for ``linear``.
+        scale_m: metres per unit of the stored value, for ``linear``.
         offset: in units of the stored value, for ``linear``.
-        auto_uint8: what 8-bit values mean under ``auto``; None where only the user can know.
+        auto_uint8: see :func:`resolve_encoding`.
         where: names the file in errors.
 
     Returns:
@@ -120,19 +104,21 @@ def to_metres(
 
     Raises:
         ConfigError: if the encoding is unknown.
-        DataError: if the values cannot be meant by the encoding, or ``linear`` has no usable scale.
+        DataError: if the values do not fit the encoding, or ``linear`` has no usable scale.
     """
     if raw.ndim != 2:
-        raise DataError(f"{_at(where)}depth has shape {raw.shape}. Store one value per pixel, as [H, W].")
+        raise DataError(f"{_prefix(where)}depth has shape {raw.shape}. Store one value per pixel, as [H, W].")
     name = resolve_encoding(
         encoding, dtype=raw.dtype, has_scale=scale_m is not None, auto_uint8=auto_uint8, where=where
     )
     _check_values(raw, name, where)
     values = raw.astype(np.float64)  # float64: one rounding, at the end
     if name == "linear":
-        values = (values + offset) * _checked_scale(scale_m, offset, where)
-    else:
-        values = _TO_METRES[name](values)
+        values = (values + offset) * _check_scale(scale_m, offset, where)
+    elif name == "uint8_10m":
+        values = values / 255 * _FULL_SCALE_8BIT_M
+    elif name != "float_m":
+        values = values / 1000
     with np.errstate(over="ignore", invalid="ignore"):
         metres = values.astype(np.float32)
         metres[~(np.isfinite(metres) & (metres > 0))] = 0.0
@@ -140,12 +126,12 @@ def to_metres(
 
 
 def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str) -> DepthRange:
-    """Measure the range of some depths of a set, and refuse an indoor set whose median no room has.
+    """Measure the range of a sample of depths, and refuse an indoor set whose median is implausible for a room.
 
     Args:
-        depths: [H, W] arrays [m], 0 where unmeasured: a sample of the set.
+        depths: [H, W] arrays [m], 0 where unmeasured.
         indoor: whether the set shows rooms.
-        encoding: the set's encoding; ``paper_literal`` is let through, it is implausible on purpose.
+        encoding: the set's encoding; ``paper_literal`` is accepted, it is implausible on purpose.
         name: of the set, for errors.
 
     Raises:
@@ -168,28 +154,19 @@ def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding
         raise DataError(
             f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, "
             f"indoor sets lie in {low:g} to {high:g} m. "
-            f"Pass another data.encoding ({_others(encoding)}); "
-            "folders and manifests that are not indoors take data.source.indoor=false."
+            f"Pass another data.encoding ({_others(encoding)}), or data.source.indoor=false for outdoor pairs."
         )
     return found
-
-
-_TO_METRES: Mapping[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    "uint16_mm": lambda values: values / 1000,
-    "uint8_10m": lambda values: values / 255 * _FULL_SCALE_8BIT_M,
-    "float_m": lambda values: values,
-    "paper_literal": lambda values: values / 1000,
-}
 
 
 def _check_values(raw: NDArray[np.generic], name: str, where: str) -> None:
     integer, bits = raw.dtype.kind in "ui", raw.dtype.itemsize * 8
     if raw.dtype.kind not in "uif":
-        raise DataError(f"{_at(where)}depth values of type {raw.dtype} are no numbers. Store integers or floats.")
+        raise DataError(f"{_prefix(where)}depth values of type {raw.dtype} are not numbers. Store integers or floats.")
     if name == "uint16_mm" and integer and bits == 8:
         largest = int(raw.max(initial=0))
         raise DataError(
-            f"{_at(where)}8-bit data declared as millimetres "
+            f"{_prefix(where)}8-bit data declared as millimetres "
             f"(largest value {largest} = {largest / 1000:g} m). {_ADVICE_8BIT}"
         )
     fits = {
@@ -200,18 +177,18 @@ def _check_values(raw: NDArray[np.generic], name: str, where: str) -> None:
     }
     if not fits.get(name, True):
         likely = "float_m" if not integer else "uint8_10m" if raw.dtype == np.uint8 else "uint16_mm"
-        raise DataError(f"{_at(where)}{raw.dtype} data declared as {name}. Use data.encoding={likely}.")
+        raise DataError(f"{_prefix(where)}{raw.dtype} data declared as {name}. Use data.encoding={likely}.")
 
 
-def _checked_scale(scale_m: float | None, offset: float, where: str) -> float:
+def _check_scale(scale_m: float | None, offset: float, where: str) -> float:
     if scale_m is None:
         raise DataError(
-            f"{_at(where)}data.encoding=linear needs a scale for each image, and there is none. "
+            f"{_prefix(where)}data.encoding=linear needs a scale for each image, and there is none. "
             "Add the column depth_scale_m to the index, or pass another data.encoding."
         )
     if not (np.isfinite(scale_m) and scale_m > 0 and np.isfinite(offset)):
         raise DataError(
-            f"{_at(where)}depth scale {scale_m} m with offset {offset}. "
+            f"{_prefix(where)}depth scale {scale_m} m with offset {offset}. "
             "The scale must be positive and both must be finite."
         )
     return scale_m
@@ -221,5 +198,5 @@ def _others(encoding: str) -> str:
     return ", ".join(other for other in ENCODINGS if other not in (encoding, "auto"))
 
 
-def _at(where: str) -> str:
+def _prefix(where: str) -> str:
     return f"{where}: " if where else ""

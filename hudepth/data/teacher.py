@@ -18,7 +18,8 @@ from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
 from hudepth.data.prepare import MAX_SIZES
 from hudepth.data.sources.base import Record
-from hudepth.data.sources.files import PerProcess, read_depth
+from hudepth.data.sources.decoding import read_depth
+from hudepth.data.sources.files import PerProcess
 from hudepth.data.store import DepthStore
 
 ENDINGS = (".npy", ".png", "_depth.npy", "_depth.png")

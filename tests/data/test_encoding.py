@@ -153,14 +153,14 @@ REFUSED = [
         np.zeros((1, 1), np.uint8),
         "auto",
         None,
-        "'0.png': uint8 depth does not tell its unit. Pass data.encoding=uint8_10m (value/255*10 m) "
+        "'0.png': the unit of uint8 depth is unknown. Pass data.encoding=uint8_10m (value/255*10 m) "
         "or paper_literal (value/1000 m).",
     ),
     (
         np.zeros((1, 1), np.int32),
         "auto",
         None,
-        "'0.png': int32 depth does not tell its unit. Pass data.encoding=uint16_mm.",
+        "'0.png': the unit of int32 depth is unknown. Pass data.encoding=uint16_mm.",
     ),
     (
         np.zeros((1, 1), np.uint8),
@@ -185,7 +185,7 @@ REFUSED = [
         np.zeros((1, 1), bool),
         "float_m",
         None,
-        "'0.png': depth values of type bool are no numbers. Store integers or floats.",
+        "'0.png': depth values of type bool are not numbers. Store integers or floats.",
     ),
     (
         np.zeros((2, 3, 1), np.uint16),
@@ -204,12 +204,8 @@ def test_refuses(raw: np.ndarray, encoding: str, scale_m: float | None, message:
 
 
 def test_unknown_encoding() -> None:
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=r"data\.encoding: .*Did you mean 'uint16_mm'"):
         to_metres(np.zeros((1, 1), np.uint16), "uint16_m")
-    assert str(caught.value) == (
-        "data.encoding: no encoding 'uint16_m'. Did you mean 'uint16_mm'? "
-        "Choose one of auto, uint16_mm, uint8_10m, float_m, linear, paper_literal."
-    )
 
 
 def test_range_is_of_the_measured_pixels() -> None:
@@ -225,8 +221,8 @@ def test_range_refuses_an_implausible_room(depth_m: float, shown: str) -> None:
         check_range(depths, indoor=True, encoding="uint16_mm", name="folder")
     assert str(caught.value) == (
         f"data.encoding=uint16_mm: 'folder' has a median depth of {shown} m, indoor sets lie in 0.3 to 20 m. "
-        "Pass another data.encoding (uint8_10m, float_m, linear, paper_literal); "
-        "folders and manifests that are not indoors take data.source.indoor=false."
+        "Pass another data.encoding (uint8_10m, float_m, linear, paper_literal), "
+        "or data.source.indoor=false for outdoor pairs."
     )
     assert check_range(depths, indoor=False, encoding="uint16_mm", name="folder").median_m == np.float32(depth_m)
 

@@ -1,4 +1,4 @@
-"""What every source of image/depth pairs offers. A source lists its records cheaply and reads one pair at a time."""
+"""The interface of a data set: it lists its records cheaply and reads one pair at a time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
+from hudepth.base.options import check, convert
+from hudepth.data.encoding import Encoding
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One image/depth pair of a source, named but not read."""
+    """One image/depth pair of a source, before it is read."""
 
     id: str
     """Unique in its source and the same on every machine, for example ``00012`` or ``kitchen_0004/17``."""
@@ -27,13 +29,13 @@ class Record:
     frame: int
     """Position within the scene (video order where there is one)."""
     split: str = ""
-    """The set's own split: ``train``, ``test``, or empty where it has none."""
+    """The data set's own split: ``train``, ``test``, or empty if it has none."""
     category: str = ""
-    """Kind of scene where the set knows it, for example ``kitchen``."""
+    """Kind of scene, for example ``kitchen``; empty if unknown."""
     image: str = ""
-    """Where the image lies, as the source's ``read`` understands it (a path relative to the root, or empty)."""
+    """Location of the image, in the form the source's ``read`` expects (usually a path relative to the root)."""
     depth: str = ""
-    """Where the depth lies, likewise."""
+    """Location of the depth map, likewise."""
     depth_scale_m: float | None = None
     """For the ``linear`` encoding: depth [m] = (value + depth_offset) * depth_scale_m."""
     depth_offset: float = 0.0
@@ -51,19 +53,30 @@ class RawPair:
 
 
 class Source(ABC):
-    """A data set in some form on disk (or made up), seen as a list of records and a way to read each.
+    """A data set in some form on disk, or generated: a list of records and a way to read each.
 
-    A source is picklable, so that worker processes can have a copy: file handles are opened lazily and left behind.
+    To add a data set, write one subclass and one configuration file in ``conf/data/``. Sources must be picklable, since
+    worker processes get a copy: open file handles lazily (:class:`hudepth.data.sources.files.PerProcess`).
     """
 
     name: ClassVar[str]
-    """What the configuration calls it."""
+    """Name of the data set, part of the name of its depth stores."""
+    homepage: ClassVar[str] = ""
+    """Where the data set is published."""
+    licence: ClassVar[str] = "other"
+    """Licence identifier of the data for model cards, for example ``mit``."""
+    terms: ClassVar[str] = ""
+    """What the data is and what its owners permit, in a sentence for model cards."""
     encoding: str
     """How depth values become metres; one of :data:`hudepth.data.encoding.ENCODINGS`."""
     indoor: bool = True
-    """Indoor sets are refused if their median depth is implausible for a room."""
+    """Whether depths must be plausible for rooms."""
     auto_uint8: ClassVar[str | None] = None
-    """What 8-bit depth means under ``encoding=auto``; None where only the user can know."""
+    """Encoding of 8-bit depth under ``encoding=auto``; None if only the user can know."""
+
+    def __post_init__(self) -> None:  # of sources that are dataclasses: their fields are their options
+        self.encoding = convert("data.encoding", self.encoding, Encoding | None)
+        check(self, prefix="data.source.")
 
     @abstractmethod
     def records(self) -> Sequence[Record]:
@@ -78,19 +91,15 @@ class Source(ABC):
         """Decode one pair.
 
         Raises:
-            DataError: if a file is missing, truncated, or the two differ in size; the message names the file.
+            DataError: if a file is missing, truncated, too large, or image and depth differ in size.
         """
 
     def files(self) -> Sequence[Path]:
-        """Every file this source reads (none for a source that makes its frames up)."""
+        """Return every file this source reads; empty for generated data."""
         return []
 
     def fingerprint(self) -> str:
-        """sha256 over the records and the sizes of their files: equal on every machine that holds the same set.
-
-        Raises:
-            DataError: as :meth:`records`.
-        """
+        """Return a sha256 over the records and the sizes of their files, equal on every machine with the same data."""
         digest = hashlib.sha256(json.dumps([asdict(record) for record in self.records()]).encode())
         for path in self.files():
             size = path.stat().st_size if path.exists() else -1
@@ -99,18 +108,12 @@ class Source(ABC):
 
 
 def existing_root(root: str | Path | None, *, expects: str) -> Path:
-    """Return ``root`` as a path.
-
-    Args:
-        root: what the user gave as ``data.root``.
-        expects: what should be there, for the error message.
+    """Return ``data.root`` as a path; ``expects`` describes in errors what should be there.
 
     Raises:
         DataError: if no root was given or it does not exist.
     """
-    if not root:
-        raise DataError(f"data.root is not set. Pass data.root=<{expects}>, or run with data=rooms.")
-    path = Path(root).expanduser()
-    if not path.exists():
-        raise DataError(f"data.root: '{path}' does not exist. Pass data.root=<{expects}>, or run with data=rooms.")
-    return path
+    if root and (path := Path(root).expanduser()).exists():
+        return path
+    found = f": '{root}' does not exist" if root else " is not set"
+    raise DataError(f"data.root{found}. Pass data.root=<{expects}>, or run with data=rooms.")

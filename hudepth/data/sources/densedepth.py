@@ -1,4 +1,4 @@
-"""The training frames and the test set that DenseDepth published, the data of most small models."""
+"""DenseDepth's packaging of NYU Depth V2: its training frames and test set, the data of most small models."""
 
 from __future__ import annotations
 
@@ -6,29 +6,32 @@ import re
 import zipfile
 import zlib
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.errors import DataError
 from hudepth.base.images import read_bytes
-from hudepth.data.encoding import check_encoding
+from hudepth.base.options import Choice
+from hudepth.data.encoding import Encoding
 from hudepth.data.sources.base import RawPair, Record, Source, existing_root
-from hudepth.data.sources.files import PerProcess, csv_rows, make_pair, read_depth, read_image
-from hudepth.data.sources.pairing import category_of
+from hudepth.data.sources.decoding import read_depth, read_image
+from hudepth.data.sources.files import PerProcess, csv_rows, make_pair
+from hudepth.data.sources.nyu import Nyu, category_of
 
 MAX_MEMBER_BYTES = 64 << 20
 """Larger members of the zip file are refused before they are decompressed."""
 
 _ZIP = "nyu_data.zip"
 _LISTS = {"train": "nyu2_train.csv", "test": "nyu2_test.csv"}
-_SUBSETS = ("train", "test", "all")
 _FRAME = {
     "train": re.compile(r"data/nyu2_train/(?P<scene>[^/\\]+)_out/(?P<number>[0-9]{1,9})\.(jpe?g|png)"),
     "test": re.compile(r"data/nyu2_test/(?P<scene>)(?P<number>[0-9]{1,9})_(colors|depth)\.png"),
 }
 
 
-class DenseDepthSource(Source):
+@dataclass(eq=False)
+class DenseDepthSource(Nyu, Source):
     """DenseDepth's ``nyu_data.zip``, in place or unpacked: 50,688 training and 654 test pairs of 640 x 480.
 
     Published by Alhashim and Wonka (2018). Two lists without a header name the files:
@@ -38,7 +41,7 @@ class DenseDepthSource(Source):
     - ``data/nyu2_test.csv``: ``data/nyu2_test/NNNNN_colors.png`` and ``NNNNN_depth.png``; the official
       test frames, 16-bit millimetres, scene unknown (empty).
 
-    ``encoding="auto"`` reads both rightly.
+    ``encoding="auto"`` reads both correctly.
 
     Args:
         root: the zip file, the folder with the zip file, the unpacked folder, or its folder ``data``.
@@ -49,28 +52,25 @@ class DenseDepthSource(Source):
     name: ClassVar[str] = "densedepth"
     auto_uint8: ClassVar[str | None] = "uint8_10m"
 
-    def __init__(self, root: str | Path | None, *, subset: str = "train", encoding: str = "auto") -> None:
-        self.root = root
-        self.subset = subset
-        self.encoding = encoding
+    root: str | Path | None
+    _: KW_ONLY
+    subset: Annotated[str, Choice(("train", "test", "all"))] = "train"
+    encoding: Encoding = "auto"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._handle = PerProcess(_open)
-        self._records: list[Record] | None = None
+        self._records: list[Record] = []
 
     def records(self) -> Sequence[Record]:
-        """List the pairs in order of the CSV files, which are read once; the images need not be there.
-
-        Raises:
-            ConfigError: if an option is unknown.
-            DataError: if a list is missing, empty or malformed.
-        """
-        if self._records is None:
-            check_encoding(self.encoding)
-            self._records = self._listed()
+        """List the pairs in order of the CSV files, which are read once; see :meth:`Source.records`."""
+        if not self._records:
+            self._records = self._read_lists()
         return self._records
 
-    def _listed(self) -> list[Record]:
+    def _read_lists(self) -> list[Record]:
         records: list[Record] = []
-        lines: dict[str, str] = {}
+        lines: dict[str, int] = {}
         for split in self._splits():
             name = f"data/{_LISTS[split]}"
             index = self._where(name)
@@ -81,50 +81,31 @@ class DenseDepthSource(Source):
                 where = f"{index} line {line}"
                 record = _record(cells, split, where)
                 if record.id in lines:
-                    raise DataError(f"{where}: '{record.id}' is listed already, in {lines[record.id]}. Remove one.")
-                lines[record.id] = f"line {line}"
+                    raise DataError(f"{where}: '{record.id}' is already on line {lines[record.id]}. Remove one.")
+                lines[record.id] = line
                 records.append(record)
         return records
 
     def read(self, record: Record) -> RawPair:
-        """Decode one pair.
-
-        Raises:
-            DataError: if a file is missing, too large, truncated, or the two differ in size.
-        """
+        """Decode one pair; see :meth:`Source.read`."""
         for name in (record.image, record.depth):
-            if not _FRAME["train"].fullmatch(name) and not _FRAME["test"].fullmatch(name):
-                raise DataError(f"{self._where(name)}: not a name of DenseDepth's frames.")
+            if not any(pattern.fullmatch(name) for pattern in _FRAME.values()):
+                raise DataError(f"{self._where(name)}: not the name of a DenseDepth frame.")
         image_where, depth_where = self._where(record.image), self._where(record.depth)
-        return make_pair(
-            read_image(self._bytes(record.image), where=image_where),
-            read_depth(self._bytes(record.depth), where=depth_where),
-            image_where=image_where,
-            depth_where=depth_where,
-        )
+        image = read_image(self._bytes(record.image), where=image_where)
+        depth = read_depth(self._bytes(record.depth), where=depth_where)
+        return make_pair(image, depth, image_where=image_where, depth_where=depth_where)
 
     def files(self) -> Sequence[Path]:
-        """Return the zip file, or the lists and every file on them.
-
-        Raises:
-            DataError: as :meth:`records`.
-        """
+        """Return the zip file, or the lists and every file they name."""
         place = self._place()
         if place.is_file():
             return [place]
-        lists = [place / _LISTS[split] for split in self._splits()]
-        return [
-            *lists,
-            *(_below(place, name) for record in self.records() for name in (record.image, record.depth)),
-        ]
+        names = [name for record in self.records() for name in (record.image, record.depth)]
+        return [*(place / _LISTS[split] for split in self._splits()), *(_below(place, name) for name in names)]
 
     def _splits(self) -> Sequence[str]:
-        if self.subset not in _SUBSETS:
-            raise ConfigError(
-                f"data.source.subset: no subset '{self.subset}'.{did_you_mean(self.subset, _SUBSETS)} "
-                f"Choose one of {', '.join(_SUBSETS)}."
-            )
-        return ("train", "test") if self.subset == "all" else (self.subset,)
+        return tuple(_LISTS) if self.subset == "all" else (self.subset,)
 
     def _place(self) -> Path:
         """Return the zip file or the folder that holds the lists."""
@@ -161,7 +142,7 @@ def _record(cells: Sequence[str], split: str, where: str) -> Record:
     frames = [_FRAME[split].fullmatch(cell.strip()) for cell in cells]
     if len(frames) != 2 or frames[0] is None or frames[1] is None:
         raise DataError(
-            f"{where}: {','.join(cells)[:120]!r} is no pair of DenseDepth's {split} set. Copy the list again."
+            f"{where}: {','.join(cells)[:120]!r} is not a pair of DenseDepth's {split} set. Copy the list again."
         )
     image, depth = frames[0], frames[1]
     scene, number = image["scene"], image["number"]

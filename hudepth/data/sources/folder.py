@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
 from hudepth.base.errors import DataError
-from hudepth.data.encoding import ENCODINGS, check_encoding
-from hudepth.data.sources.base import RawPair, Record, Source, existing_root
-from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inside, read_pair
-from hudepth.data.sources.pairing import add_unique, pair_up, walk_files
+from hudepth.data.encoding import ENCODINGS, Encoding
+from hudepth.data.sources.base import Record, existing_root
+from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, FileSource, inside
+from hudepth.data.sources.pairing import pair_up, unique_keys, walk_files
 
 
-class FolderSource(Source):
+@dataclass(eq=False)
+class FolderSource(FileSource):
     """Your own pairs: images and depth maps with equal names in two folders, or in one folder with suffixes.
 
     ``images/kitchen/01.jpg`` belongs to ``depths/kitchen/01.png``, and its scene is ``kitchen``. With both
     folders ``.``, ``image_suffix="_rgb"`` and ``depth_suffix="_depth"``, ``01_rgb.jpg`` belongs to
     ``01_depth.png``. Images are JPEG or PNG; depth maps are PNG of 8 or 16 bits, two-dimensional ``.npy``,
-    or TIFF. Files of other kinds are left alone. Units are whatever ``encoding`` says: no file of this
-    layout tells them.
+    or TIFF. Files of other kinds are ignored.
 
     Args:
         root: the folder that holds both.
@@ -28,45 +29,29 @@ class FolderSource(Source):
         depths: folder of the depth maps, likewise.
         image_suffix: end of an image's name, before its extension.
         depth_suffix: end of a depth map's name, likewise.
-        encoding: how depth values become metres; required.
-        indoor: whether the set shows rooms, for the check of its depth range.
+        encoding: how depth values become metres; required, since the files do not state it.
+        indoor: whether depths must be plausible for rooms.
     """
 
     name: ClassVar[str] = "folder"
 
-    def __init__(
-        self,
-        root: str | Path | None,
-        *,
-        images: str = "images",
-        depths: str = "depths",
-        image_suffix: str = "",
-        depth_suffix: str = "",
-        encoding: str | None = None,
-        indoor: bool = True,
-    ) -> None:
-        self.root = root
-        self.images = images
-        self.depths = depths
-        self.image_suffix = image_suffix
-        self.depth_suffix = depth_suffix
-        self.encoding = encoding or ""
-        self.indoor = indoor
+    root: str | Path | None
+    _: KW_ONLY
+    images: str = "images"
+    depths: str = "depths"
+    image_suffix: str = ""
+    depth_suffix: str = ""
+    encoding: Encoding | None = None  # type: ignore[assignment]  # checked by records()
+    indoor: bool = True
 
     def records(self) -> Sequence[Record]:
-        """List the pairs in natural order of their names.
-
-        Raises:
-            ConfigError: if the encoding is unknown.
-            DataError: if no encoding is given, there are no pairs, or a file has no partner.
-        """
-        root = self._root()
+        """List the pairs in natural order of their names; see :meth:`Source.records`."""
+        root = self.folder()
         if not self.encoding:
             raise DataError(
-                f"data.encoding is not set, and a folder does not tell its units. Choose one of {', '.join(ENCODINGS)}."
+                f"data.encoding is not set, and a folder does not state its unit. Pass one of {', '.join(ENCODINGS)}."
             )
-        check_encoding(self.encoding)
-        images, depths = self._named(root)
+        images, depths = self._find(root)
         expects = (
             f"'{self.images}/<name>{self.image_suffix}.jpg' "
             f"with '{self.depths}/<name>{self.depth_suffix}.png' (or .npy, .tif)"
@@ -79,48 +64,30 @@ class FolderSource(Source):
             records.append(Record(id=key, scene=scene, frame=frames[scene], image=image, depth=depth))
         return records
 
-    def read(self, record: Record) -> RawPair:
-        """Decode one pair.
-
-        Raises:
-            DataError: if a file is missing, truncated, or the two differ in size.
-        """
-        root = self._root()
-        image, depth = (inside(root, name, where="data.root") for name in (record.image, record.depth))
-        return read_pair(image, depth)
-
-    def files(self) -> Sequence[Path]:
-        """Return every image and depth map.
-
-        Raises:
-            DataError: as :meth:`records`.
-        """
-        root = self._root()
-        return [root / name for record in self.records() for name in (record.image, record.depth)]
-
-    def _root(self) -> Path:
+    def folder(self) -> Path:
+        """Return the root."""
         return existing_root(self.root, expects=f"folder with {self.images} and {self.depths}")
 
-    def _named(self, root: Path) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the path of each image and of each depth map by the name they share."""
+    def _find(self, root: Path) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the path of each image and of each depth map by their common name."""
         shared = PurePosixPath(self.images) == PurePosixPath(self.depths)
         if shared and self.image_suffix == self.depth_suffix:
             raise DataError(
-                f"data.source.images and data.source.depths are both '{self.images}', "
-                "images and depth maps look alike. "
-                "Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as your files are named."
+                f"data.source.images and data.source.depths are both '{self.images}', so images and depth maps cannot "
+                "be told apart. Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as they are named."
             )
-        images = self._keys(root, self.images, self.image_suffix, IMAGE_SUFFIXES, what="images")
-        depths = self._keys(root, self.depths, self.depth_suffix, DEPTH_SUFFIXES, what="depths")
+        images = self._list(root, self.images, self.image_suffix, IMAGE_SUFFIXES, what="images")
+        depths = self._list(root, self.depths, self.depth_suffix, DEPTH_SUFFIXES, what="depths")
         if shared:  # where one suffix ends with the other, the longer one decides
             longer, shorter = (depths, images) if len(self.depth_suffix) > len(self.image_suffix) else (images, depths)
             taken = {path for _, path in longer}
             shorter[:] = [(key, path) for key, path in shorter if path not in taken]
-        return _by_key(images, what="image"), _by_key(depths, what="depth")
+        return unique_keys(images, what="image"), unique_keys(depths, what="depth")
 
-    def _keys(
+    def _list(
         self, root: Path, folder: str, suffix: str, extensions: Sequence[str], *, what: str
     ) -> list[tuple[str, str]]:
+        """Return (key, path) of the files of one kind."""
         base = inside(root, folder, where=f"data.source.{what}")
         if not base.is_dir():
             raise DataError(
@@ -132,10 +99,3 @@ class FolderSource(Source):
             for path in walk_files(base)
             if path.suffix.lower() in extensions and path.stem.endswith(suffix)
         ]
-
-
-def _by_key(files: Sequence[tuple[str, str]], *, what: str) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for key, path in files:
-        add_unique(found, key, path, what=what)
-    return found

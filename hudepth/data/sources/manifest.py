@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from hudepth.base.errors import DataError
 from hudepth.base.images import read_bytes
-from hudepth.data.encoding import check_encoding
-from hudepth.data.sources.base import RawPair, Record, Source, existing_root
-from hudepth.data.sources.files import csv_rows, inside, read_pair
+from hudepth.data.encoding import Encoding
+from hudepth.data.sources.base import Record, existing_root
+from hudepth.data.sources.files import FileSource, csv_rows, inside
+from hudepth.data.sources.nyu import Nyu
 
 _REQUIRED = ("image", "depth")
 _SPLITS = ("", "train", "test")
 
 
-class ManifestSource(Source):
-    """Any set of pairs with a list: one CSV file beside the data, one line a pair, a header line first.
+@dataclass(eq=False)
+class ManifestSource(FileSource):
+    """Any set of pairs with a list: a CSV file next to the data, a header and then one line per pair.
 
     ================= ========================================================================================
     column            content
@@ -41,32 +44,19 @@ class ManifestSource(Source):
         root: the folder, or the CSV file itself.
         manifest: name of the CSV file within the folder.
         encoding: how depth values become metres.
-        indoor: whether the set shows rooms, for the check of its depth range.
+        indoor: whether depths must be plausible for rooms.
     """
 
     name: ClassVar[str] = "manifest"
 
-    def __init__(
-        self,
-        root: str | Path | None,
-        *,
-        manifest: str = "index.csv",
-        encoding: str = "auto",
-        indoor: bool = True,
-    ) -> None:
-        self.root = root
-        self.manifest = manifest
-        self.encoding = encoding
-        self.indoor = indoor
+    root: str | Path | None
+    _: KW_ONLY
+    manifest: str = "index.csv"
+    encoding: Encoding = "auto"
+    indoor: bool = True
 
     def records(self) -> Sequence[Record]:
-        """List the pairs in order of the CSV file.
-
-        Raises:
-            ConfigError: if the encoding is unknown.
-            DataError: if the file is missing, empty or malformed, or a path leaves the folder.
-        """
-        check_encoding(self.encoding)
+        """List the pairs in order of the CSV file; see :meth:`Source.records`."""
         folder, index = self._place()
         rows = csv_rows(read_bytes(index), where=f"'{index}'")
         header = [cell.strip() for cell in rows[0][1]] if rows else []
@@ -92,24 +82,13 @@ class ManifestSource(Source):
             raise DataError(f"'{index}': lists no pairs. Add a line for each pair.")
         return records
 
-    def read(self, record: Record) -> RawPair:
-        """Decode one pair.
-
-        Raises:
-            DataError: if a file is missing, outside the folder, truncated, or the two differ in size.
-        """
-        folder, index = self._place()
-        image, depth = (inside(folder, name, where=f"'{index}'") for name in (record.image, record.depth))
-        return read_pair(image, depth)
+    def folder(self) -> Path:
+        """Return the folder of the CSV file."""
+        return self._place()[0]
 
     def files(self) -> Sequence[Path]:
-        """Return the list and every file on it.
-
-        Raises:
-            DataError: as :meth:`records`.
-        """
-        folder, index = self._place()
-        return [index, *(folder / name for record in self.records() for name in (record.image, record.depth))]
+        """Return the CSV file and every file it lists."""
+        return [self._place()[1], *super().files()]
 
     def _place(self) -> tuple[Path, Path]:
         root = existing_root(self.root, expects=f"folder with {self.manifest}")
@@ -149,14 +128,14 @@ class ManifestSource(Source):
         return row.get("id") or row.get("index") or str(Path(row["image"]).with_suffix("").as_posix())
 
 
-class NyuLabeledSource(ManifestSource):
-    """The labelled NYU Depth V2 set as single files: labelled set, 8-bit depth with one scale per image.
+@dataclass(eq=False)
+class NyuLabeledSource(Nyu, ManifestSource):
+    """The labelled NYU Depth V2 set as single files, its depth in 8 bits with one scale per image.
 
     1449 pairs of 640 x 480 from 464 scenes, official split of 795 training and 654 test frames (Silberman,
-    Hoiem, Kohli and Fergus, ECCV 2012). ``NNNNN.jpg`` is the image and ``NNNNN.png`` the in-painted depth
-    in 8 bits; each line of ``index.csv`` gives the scale and offset that make metres of it, in steps of 5
-    to 39 mm. Columns as :class:`ManifestSource`, with ``index`` counted from 0; it is padded to five digits
-    to give the id.
+    Hoiem, Kohli and Fergus, ECCV 2012). ``NNNNN.jpg`` is the image and ``NNNNN.png`` the in-painted depth;
+    ``index.csv`` gives the scale and offset that turn it into metres, in steps of 5 to 39 mm. Columns as in
+    :class:`ManifestSource`; the id is ``index``, which counts from 0, padded to five digits.
     """
 
     name: ClassVar[str] = "nyu_labeled"
@@ -166,7 +145,7 @@ class NyuLabeledSource(ManifestSource):
 
 
 def _number(row: Mapping[str, str], column: str, where: str) -> float | None:
-    text = row.get(column, "")
+    text = row.get(column)
     if not text:
         return None
     try:
@@ -179,9 +158,7 @@ def _number(row: Mapping[str, str], column: str, where: str) -> float | None:
 
 
 def _whole(row: Mapping[str, str], column: str, where: str, *, otherwise: int) -> int:
-    text = row.get(column, "")
-    if not text:
-        return otherwise
+    text = row.get(column) or str(otherwise)
     if not (text.isascii() and text.isdigit() and len(text) < 19):
         raise DataError(f"{where}: {column} is '{text}'. Write a whole number, or leave the cell empty.")
     return int(text)

@@ -1,10 +1,10 @@
-"""Pairs images with depth maps by name, for data sets that bring no list."""
+"""Pair images with depth maps by name, for data sets without a list."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
 from hudepth.base.errors import DataError
@@ -19,15 +19,18 @@ def walk_files(root: Path) -> Iterator[PurePosixPath]:
             yield inner / name
 
 
-def add_unique(found: dict[str, str], key: str, path: str, *, what: str) -> None:
-    """Note the file of a key.
+def unique_keys(files: Iterable[tuple[str, str]], *, what: str) -> dict[str, str]:
+    """Return the path of each key, of (key, path) pairs.
 
     Raises:
-        DataError: if the key has one already.
+        DataError: if two files have the same key.
     """
-    if key in found:
-        raise DataError(f"'{found[key]}' and '{path}' are both the {what} of '{key}'. Keep one of them.")
-    found[key] = path
+    found: dict[str, str] = {}
+    for key, path in files:
+        if key in found:
+            raise DataError(f"'{found[key]}' and '{path}' are both the {what} of '{key}'. Keep one of them.")
+        found[key] = path
+    return found
 
 
 def pair_up(
@@ -38,7 +41,7 @@ def pair_up(
     Args:
         images: path of each image by key.
         depths: path of each depth map by key.
-        root: where they lie, for errors.
+        root: their folder, for errors.
         expects: what names should look like, for errors.
 
     Raises:
@@ -46,16 +49,12 @@ def pair_up(
     """
     if not images and not depths:
         raise DataError(f"data.root: no pairs in '{root}'. Expected {expects}.")
-    if alone := sorted(images.keys() - depths.keys(), key=natural_key):
-        raise DataError(
-            f"data.root: {len(alone)} of {len(images)} images in '{root}' have no depth, "
-            f"the first is '{images[alone[0]]}'. Expected {expects}."
-        )
-    if alone := sorted(depths.keys() - images.keys(), key=natural_key):
-        raise DataError(
-            f"data.root: {len(alone)} of {len(depths)} depth maps in '{root}' have no image, "
-            f"the first is '{depths[alone[0]]}'. Expected {expects}."
-        )
+    for here, there, what, partner in ((images, depths, "images", "depth"), (depths, images, "depth maps", "image")):
+        if alone := sorted(here.keys() - there.keys(), key=natural_key):
+            raise DataError(
+                f"data.root: {len(alone)} of {len(here)} {what} in '{root}' have no {partner}, "
+                f"the first is '{here[alone[0]]}'. Expected {expects}."
+            )
     return [(key, images[key], depths[key]) for key in sorted(images, key=natural_key)]
 
 
@@ -63,8 +62,3 @@ def natural_key(text: str) -> tuple[list[tuple[str, int]], str]:
     """Return a sorting key that compares the numbers within a name as numbers."""
     parts = re.findall(r"([^0-9]*)([0-9]*)", text)
     return [(word, int(digits or -1)) for word, digits in parts], text
-
-
-def category_of(scene: str) -> str:
-    """Return the kind of an NYU scene: its name without its number, ``kitchen`` for ``kitchen_0004``."""
-    return re.sub(r"_\d{4}[a-z]?$", "", scene.rsplit("/", 1)[-1])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.camera import Intrinsics
-from hudepth.base.errors import ConfigError, DataError, did_you_mean
+from hudepth.base.errors import DataError
+from hudepth.base.options import Broadcast, Choice, Range, convert
 from hudepth.data.rooms.fittings import CATEGORIES
 from hudepth.data.rooms.furnishing import VARIETIES
 from hudepth.data.rooms.materials import noise
@@ -23,8 +24,9 @@ from hudepth.data.sources.base import RawPair, Record, Source
 RENDERER_VERSION = 1
 """Raise it whenever a change alters any frame: prepared data with another version is out of date."""
 
+_COUNT = Annotated[int, Range(1)]
+_SIZE = Annotated[tuple[int, int], Range(16, 2048), Broadcast(), "[height,width], each from 16 to 2048"]
 _TEST_FRACTION = 0.2
-_SIDE_PX = (16, 2048)
 _BASELINE_M = 0.075
 _KINECT_RANGE_M = 8.0
 
@@ -32,25 +34,28 @@ _KINECT_RANGE_M = 8.0
 class RoomsSource(Source):
     """Furnished rooms, ray-cast with exact depth and the camera of NYU Depth V2.
 
-    Each scene is one room with its own furniture, colours and lamps; its frames come from one camera that
-    sways and looks about. Depth is z-depth: the distance along the optical axis in metres (NYU's convention),
-    not the length of the ray. Frames depend on ``seed``, scene, frame and ``size`` alone.
+    Each scene is one room with its own furniture, colours and lamps, seen by one moving camera. Depth is z-depth:
+    the distance along the optical axis in metres (NYU's convention), not the length of the ray. Frames depend only on
+    ``seed``, scene, frame and ``size``.
 
     Args:
         scenes: number of rooms, at least 1. The last fifth (at least one room of two) is the ``test`` split.
         frames_per_scene: at least 1.
-        size: (height, width) in pixels, each 16 to 2048. The field of view is NYU's whatever the size.
-        seed: at least 0; another seed gives other rooms.
-        variety: ``usual``, or ``wide``: rooms of more sizes, fuller, seen from nearer, farther, lower, higher and more
-            steeply. To train on for real images: depths spread more as in NYU Depth V2.
-        holes: take depth away (0) where a Kinect would not measure: in its projector's shadow, on grazing and
-            dark surfaces, beyond 8 m, along the border, and in blobs. All else stays the same.
+        size: (height, width) in pixels, each 16 to 2048; the field of view is always NYU's.
+        seed: at least 0; each seed gives other rooms.
+        variety: ``usual``, or ``wide``: more sizes of rooms, fuller, seen from more distances, heights and angles. Use
+            it to train for real images: depths are distributed more as in NYU Depth V2.
+        holes: remove depth (0) where a Kinect would not measure: in its projector's shadow, on grazing and
+            dark surfaces, beyond 8 m, along the border, and in blobs. Everything else stays the same.
 
     Raises:
         ConfigError: if an option is out of range.
     """
 
     name: ClassVar[str] = "rooms"
+    licence: ClassVar[str] = "mit"
+    terms: ClassVar[str] = "Synthetic rooms that hudepth ray-casts itself (MIT, like hudepth): no photograph was used."
+
     encoding: str = "float_m"
 
     def __init__(
@@ -58,29 +63,17 @@ class RoomsSource(Source):
         *,
         scenes: int = 48,
         frames_per_scene: int = 5,
-        size: tuple[int, int] | list[int] = (240, 320),
+        size: int | Sequence[int] = (240, 320),
         seed: int = 0,
         variety: str = "usual",
         holes: bool = False,
     ) -> None:
-        self.scenes = _whole("scenes", scenes, at_least=1)
-        self.frames_per_scene = _whole("frames_per_scene", frames_per_scene, at_least=1)
-        self.seed = _whole("seed", seed, at_least=0)
-        if not isinstance(size, (tuple, list)) or len(size) != 2 or not all(_is_side(side) for side in size):
-            low, high = _SIDE_PX
-            raise ConfigError(
-                f"data.source.size: got {size!r}. Pass [height, width], two whole numbers from {low} to {high}, "
-                "for example [240, 320]."
-            )
-        if variety not in VARIETIES:
-            raise ConfigError(
-                f"data.source.variety: no '{variety}'.{did_you_mean(str(variety), VARIETIES)} Pass usual or wide."
-            )
-        self.variety = variety
-        if not isinstance(holes, bool):
-            raise ConfigError(f"data.source.holes: got {holes!r}. Pass true or false.")
-        self.size = (size[0], size[1])
-        self.holes = holes
+        self.scenes: int = convert("data.source.scenes", scenes, _COUNT)
+        self.frames_per_scene: int = convert("data.source.frames_per_scene", frames_per_scene, _COUNT)
+        self.size: tuple[int, int] = convert("data.source.size", size, _SIZE)
+        self.seed: int = convert("data.source.seed", seed, Annotated[int, Range(0)])
+        self.variety: str = convert("data.source.variety", variety, Annotated[str, Choice(tuple(VARIETIES))])
+        self.holes: bool = convert("data.source.holes", holes, bool)
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -88,7 +81,7 @@ class RoomsSource(Source):
         return Intrinsics.of_nyu(*self.size)
 
     def records(self) -> Sequence[Record]:
-        """List all frames, scene by scene; nothing is rendered."""
+        """List all frames, scene by scene, without rendering any."""
         return [self._record(scene, frame) for scene in range(self.scenes) for frame in range(self.frames_per_scene)]
 
     def read(self, record: Record) -> RawPair:
@@ -143,7 +136,7 @@ def kinect_holes(depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.ran
         rng: draws which of the doubtful pixels fail.
     """
     height, width = depth.shape
-    # The projector sits beside the camera: a pixel is in shadow if one right of it is lit from further left.
+    # The projector sits next to the camera: a pixel is in shadow if one right of it is lit from further left.
     lit_from = np.arange(width, dtype=np.float32) - np.float32(fx * _BASELINE_M) / depth
     leftmost = np.minimum.accumulate(lit_from[:, ::-1], axis=1)[:, ::-1]
     shadow = lit_from > leftmost + 0.5
@@ -162,13 +155,3 @@ def kinect_holes(depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.ran
     border[:, :edge_x] = border[:, -edge_x:] = True
     holes: NDArray[np.bool_] = shadow | grazing | dark | blobs | border | (depth > _KINECT_RANGE_M)
     return holes
-
-
-def _whole(name: str, value: object, *, at_least: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < at_least:
-        raise ConfigError(f"data.source.{name}: got {value!r}. Pass a whole number of at least {at_least}.")
-    return value
-
-
-def _is_side(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and _SIDE_PX[0] <= value <= _SIDE_PX[1]

@@ -130,11 +130,12 @@ TRAIN_ROW = "data/nyu2_train/a_0001_out/1.jpg,data/nyu2_train/a_0001_out/1.png"
         ("", "'{path}': lists no pairs. Copy the file again."),
         (
             TRAIN_ROW.replace("data/nyu2_train/a_0001_out", "..") + "\n",
-            "'{path}' line 1: '../1.jpg,../1.png' is no pair of DenseDepth's train set. Copy the list again.",
+            "'{path}' line 1: '../1.jpg,../1.png' is not a pair of DenseDepth's train set. Copy the list again.",
         ),
         (
             f"{TRAIN_ROW}\ndata/nyu2_train/a_out/1.jpg\n",
-            "'{path}' line 2: 'data/nyu2_train/a_out/1.jpg' is no pair of DenseDepth's train set. Copy the list again.",
+            "'{path}' line 2: 'data/nyu2_train/a_out/1.jpg' is not a pair of DenseDepth's train set. "
+            "Copy the list again.",
         ),
         (
             TRAIN_ROW.replace("1.png", "2.png"),
@@ -143,7 +144,7 @@ TRAIN_ROW = "data/nyu2_train/a_0001_out/1.jpg,data/nyu2_train/a_0001_out/1.png"
         ),
         (
             f"{TRAIN_ROW}\n\n{TRAIN_ROW}\n",
-            "'{path}' line 3: 'a_0001/1' is listed already, in line 1. Remove one.",
+            "'{path}' line 3: 'a_0001/1' is already on line 1. Remove one.",
         ),
     ],
 )
@@ -156,16 +157,13 @@ def test_refuses_a_malformed_list(tmp_path: Path, rows: str, message: str) -> No
 @pytest.mark.parametrize("name", ["../secret.png", "data/nyu2_train/../../x.png", "/etc/passwd", "nyu2_train.csv"])
 def test_read_stays_inside(tmp_path: Path, name: str) -> None:
     source = DenseDepthSource(write(tmp_path, "folder"))
-    with pytest.raises(DataError, match=r"not a name of DenseDepth's frames\.$"):
+    with pytest.raises(DataError, match="not the name of a DenseDepth frame"):
         source.read(Record(id="x", scene="", frame=0, image=name, depth=TRAIN[0].depth))
 
 
 def test_unknown_subset(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError) as caught:
-        DenseDepthSource(tmp_path, subset="tests").records()
-    assert str(caught.value) == (
-        "data.source.subset: no subset 'tests'. Did you mean 'test'? Choose one of train, test, all."
-    )
+    with pytest.raises(ConfigError, match=r"data\.source\.subset: .*Did you mean 'test'"):
+        DenseDepthSource(tmp_path, subset="tests")
 
 
 def test_roots_that_lack_the_set(tmp_path: Path) -> None:
@@ -237,9 +235,7 @@ def test_methods_whose_output_cannot_be_bounded(tmp_path: Path, method: int) -> 
 def test_truncated_frame_in_the_zip(tmp_path: Path) -> None:
     root = tmp_path / "nyu_data.zip"
     repack(root, TRAIN[0].image, members("\n")[TRAIN[0].image][:-9])
-    assert read_refusal(root) == (
-        f"'{TRAIN[0].image}' in '{root}': the JPEG is truncated (JPEG data without its end). Copy the file again."
-    )
+    assert read_refusal(root).startswith(f"'{TRAIN[0].image}' in '{root}': the JPEG is truncated")
 
 
 def test_unequal_sizes(tmp_path: Path) -> None:

@@ -73,10 +73,7 @@ def test_reads_a_pair(tmp_path: Path, extension: str) -> None:
 
 def test_encoding_is_required(tmp_path: Path) -> None:
     write(tmp_path, "images/a.jpg", "depths/a.png")
-    assert refusal(FolderSource(tmp_path)) == (
-        "data.encoding is not set, and a folder does not tell its units. "
-        "Choose one of auto, uint16_mm, uint8_10m, float_m, linear, paper_literal."
-    )
+    assert refusal(FolderSource(tmp_path)).startswith("data.encoding is not set")
     with pytest.raises(ConfigError, match="Did you mean 'float_m'"):
         FolderSource(tmp_path, encoding="float").records()
 
@@ -116,10 +113,8 @@ def test_roots_without_pairs(tmp_path: Path) -> None:
 
 def test_one_folder_needs_suffixes(tmp_path: Path) -> None:
     write(tmp_path, "a.jpg", "a.png")
-    assert refusal(FolderSource(tmp_path, images=".", depths="./", encoding="auto")) == (
-        "data.source.images and data.source.depths are both '.', images and depth maps look alike. "
-        "Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as your files are named."
-    )
+    message = refusal(FolderSource(tmp_path, images=".", depths="./", encoding="auto"))
+    assert "data.source.image_suffix=_rgb" in message
 
 
 def test_folders_stay_inside(tmp_path: Path) -> None:

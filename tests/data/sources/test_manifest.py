@@ -209,7 +209,7 @@ def test_roots_that_lack_the_list(tmp_path: Path) -> None:
 
 
 def test_unknown_encoding(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no encoding 'linar'\. Did you mean 'linear'"):
+    with pytest.raises(ConfigError, match=r"data\.encoding: .*Did you mean 'linear'"):
         ManifestSource(tmp_path, encoding="linar").records()
 
 

@@ -95,7 +95,7 @@ def test_refusals(tmp_path: Path) -> None:
     assert refusal(NyuRawSource(tmp_path)) == (
         "'a/rgb_00000.jpg' and 'a/rgb_00000.png' are both the image of 'a/00000'. Keep one of them."
     )
-    with pytest.raises(ConfigError, match="no encoding 'mm'"):
+    with pytest.raises(ConfigError, match=r"data\.encoding: 'mm'"):
         NyuRawSource(tmp_path, encoding="mm").records()
 
 
@@ -104,9 +104,8 @@ def test_truncated_frame(tmp_path: Path) -> None:
     path = tmp_path / "rgb_00000.jpg"
     path.write_bytes(path.read_bytes()[:-10])
     source = NyuRawSource(tmp_path)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=r"rgb_00000\.jpg': the JPEG is truncated"):
         source.read(source.records()[0])
-    assert str(caught.value) == (f"'{path}': the JPEG is truncated (JPEG data without its end). Copy the file again.")
 
 
 def test_real_frames(nyu_root: Path) -> None:

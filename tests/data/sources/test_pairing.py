@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.base.errors import DataError
-from hudepth.data.sources.pairing import add_unique, category_of, natural_key, pair_up, walk_files
+from hudepth.data.sources.pairing import natural_key, pair_up, unique_keys, walk_files
 
 
 def test_numbers_sort_as_numbers() -> None:
@@ -52,10 +52,8 @@ def test_unpaired(images: dict[str, str], depths: dict[str, str], message: str) 
 
 
 def test_two_files_for_one_key() -> None:
-    found: dict[str, str] = {}
-    add_unique(found, "1", "1.jpg", what="image")
     with pytest.raises(DataError) as caught:
-        add_unique(found, "1", "1.png", what="image")
+        unique_keys([("1", "1.jpg"), ("1", "1.png")], what="image")
     assert str(caught.value) == "'1.jpg' and '1.png' are both the image of '1'. Keep one of them."
 
 
@@ -67,11 +65,3 @@ def test_walk_is_sorted_and_ignores_linked_folders(tmp_path: Path) -> None:
     (tmp_path / "secret" / "4").touch()
     (tmp_path / "set" / "link").symlink_to(tmp_path / "secret")
     assert [str(path) for path in walk_files(tmp_path / "set")] == ["0", "a/x/3", "b/1", "b/2"]
-
-
-@pytest.mark.parametrize(
-    ("scene", "category"),
-    [("kitchen_0004", "kitchen"), ("sync/study_room_0005b", "study_room"), ("office", "office"), ("", "")],
-)
-def test_category(scene: str, category: str) -> None:
-    assert category_of(scene) == category
