@@ -23,7 +23,7 @@ from hudepth.base.console import log, track
 from hudepth.base.errors import HudepthError
 from hudepth.base.files import write_json, write_text
 from hudepth.base.options import Range, convert, output_folder
-from hudepth.runs.run_dir import environment
+from hudepth.runs.environment import environment
 
 ROOMS, ROOM_SIDE_PX = 24, 112
 """Built-in rooms that the rows on units are measured on."""

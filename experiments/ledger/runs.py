@@ -12,9 +12,9 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError, HudepthError
 from hudepth.runs.history import read_history
-from hudepth.runs.identity import INCIDENTAL
-from hudepth.runs.results import MODEL, flat
-from hudepth.runs.run_dir import is_run, read_config
+from hudepth.runs.identity import INCIDENTAL, flat
+from hudepth.runs.results import MODEL
+from hudepth.runs.run import is_run, read_config
 
 """What metrics.json calls the trained network, beside the baselines."""
 NOT_RECIPE = (

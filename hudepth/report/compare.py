@@ -21,7 +21,7 @@ from hudepth.metrics.catalogue import metric_info
 from hudepth.metrics.summary import ImageTable
 from hudepth.report.scatter import draw_comparison
 from hudepth.runs.results import Result, find_result, paired
-from hudepth.runs.run_dir import CHECKPOINTS
+from hudepth.runs.run import CHECKPOINTS
 from hudepth.viz.panels import save_figure, save_panels
 
 PER_IMAGE = ("abs_rel", "rmse")

@@ -13,7 +13,7 @@ from hudepth.base.options import Range, output_folder
 from hudepth.evaluation.pictures import evenly_spaced, run_panels
 from hudepth.report.curves import draw_curves
 from hudepth.runs.history import read_history
-from hudepth.runs.run_dir import is_run, newest_run
+from hudepth.runs.run import is_run, newest_run
 from hudepth.viz.panels import save_figure, save_panels
 
 

@@ -16,7 +16,7 @@ from hudepth.base.tables import Table, stdout
 from hudepth.metrics.bootstrap import intervals
 from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.runs.results import Result, find_result, merge
-from hudepth.runs.run_dir import CHECKPOINTS
+from hudepth.runs.run import CHECKPOINTS
 
 WIDE, LOG_WIDTH = 190, 200
 """Letters that all metrics need in a line; of a log."""

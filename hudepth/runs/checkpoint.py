@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from hudepth.base.errors import CheckpointError, TrainingError
 from hudepth.base.files import written_whole
 from hudepth.base.instantiate import instantiate
-from hudepth.runs import bundles, run_dir
+from hudepth.runs import bundles
+from hudepth.runs.run import BEST, CHECKPOINTS, LAST, find_run, is_run, newest_run
 
 KEY = "hudepth"
 """Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""
@@ -128,15 +129,15 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     """
     if spec in bundles.PRETRAINED:
         return bundles.pretrained(spec)
-    path = run_dir.newest_run(runs) if spec == "last" else Path(spec).expanduser()
+    path = newest_run(runs) if spec == "last" else Path(spec).expanduser()
     if bundles.is_bundle(path):
         return path
     if path.is_dir():
-        folder = path / run_dir.CHECKPOINTS
-        for name in (run_dir.BEST, run_dir.LAST):
+        folder = path / CHECKPOINTS
+        for name in (BEST, LAST):
             if (folder / name).is_file():
                 return folder / name
-        if not run_dir.is_run(path):
+        if not is_run(path):
             raise CheckpointError(f"checkpoint: the folder '{path}' is no run directory. Pass a file, a run, or last.")
         raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint; its first epoch was never finished.")
     if not path.is_file():
@@ -205,7 +206,7 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         if not isinstance(content.get(KEY), dict) or "state_dict" not in content:
             raise CheckpointError(f"'{path}' was not written by hudepth-train: it has no '{KEY}' entry.")
         own, size_bytes = content[KEY], path.stat().st_size
-        tensors, run = content["state_dict"], run_dir.run_of(path.resolve())
+        tensors, run = content["state_dict"], find_run(path.resolve())
         epoch = content["epoch"] + 1 if isinstance(content.get("epoch"), int) else None
     if own.get("version") != VERSION:
         raise CheckpointError(

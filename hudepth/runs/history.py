@@ -9,7 +9,7 @@ from hudepth.base.errors import DataError
 
 
 def read_history(path: Path) -> list[dict[str, float]]:
-    """Read a run's metrics.csv: one row an epoch.
+    """Read a run's metrics.csv.
 
     Raises:
         DataError: if it is missing or holds no epoch.
@@ -20,7 +20,7 @@ def read_history(path: Path) -> list[dict[str, float]]:
     except (OSError, ValueError, TypeError, csv.Error) as error:  # TypeError: a row with more values than names
         raise DataError(f"'{path}' cannot be read as a history of epochs ({error}).") from error
     if not all("epoch" in row for row in rows):
-        raise DataError(f"'{path}' is no history of epochs: it has rows without an epoch.")
+        raise DataError(f"'{path}' is not a history of epochs: it has rows without an epoch.")
     if not rows:
         raise DataError(f"'{path}' holds no finished epoch.")
     return rows

@@ -7,8 +7,6 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from hudepth.runs.results import flat
-
 LABELS = ("name", "variant", "sweep_dir", "resume", "hydra", "debug")
 """Keys that name a run and say how it was started."""
 SURROUNDINGS = (
@@ -19,8 +17,18 @@ SURROUNDINGS = (
 """Keys that do not change the trained weights either: paths, hardware, pictures, and how the result is tested."""
 INCIDENTAL = (*LABELS, *SURROUNDINGS)
 """Keys in which two configurations of the same training may differ."""
+SEEDS = ("seed", "data.seed")
+"""Keys in which repetitions of a configuration differ. Not ``data.split_seed``, which makes another test set."""
 RESUMABLE = (*SURROUNDINGS, "trainer", "callbacks", "distill.teacher")
 """Keys that may change when a run is resumed; everything else is fixed by its checkpoint and its split."""
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested values by dotted key, each key with ``prefix`` before it."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
 
 
 def identity(config: Mapping[str, Any]) -> dict[str, Any]:

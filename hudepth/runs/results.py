@@ -18,6 +18,7 @@ import numpy as np
 
 from hudepth.base.errors import DataError, did_you_mean
 from hudepth.metrics.summary import ImageTable, read_per_image, summarise
+from hudepth.runs.identity import flat
 
 METRICS, PER_IMAGE = "metrics.json", "per_image.csv"
 MODEL = "model"
@@ -175,14 +176,6 @@ def _conditions(result: Result) -> dict[str, Any]:
         conditions |= {key: result.document.get(key) for key in ("network_size", "max_depth_m")}
     conditions |= {f"data.{key}": result.data.get(key) for key in ("source", "fingerprint", "encoding")}
     return conditions | {f"split.{key}": result.split.get(key) for key in ("kind", "sha256")}
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested values by dotted key, each key with ``prefix`` before it."""
-    found: dict[str, Any] = {}
-    for key, value in values.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
 
 
 def _spelt(value: Any) -> str:

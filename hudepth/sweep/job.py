@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from hudepth.base.console import setup_logging
 from hudepth.base.machine import usable_cores
 from hudepth.base.wording import one_line
-from hudepth.runs import run_dir
+from hudepth.runs.status import LockedError, read_status, write_status
 
 
 def run_job(cfg: DictConfig) -> None:
@@ -35,7 +35,7 @@ def run_job(cfg: DictConfig) -> None:
     try:
         with (path / "train.log").open("a", encoding="utf-8") as log, contextlib.redirect_stdout(log):
             train(cfg)
-    except run_dir.HeldError as error:  # not this process's run to call failed
+    except LockedError as error:  # not this process's run to call failed
         logging.getLogger("hudepth").warning("%s", error)
     except Exception as error:
         _failed(path, error)
@@ -44,12 +44,12 @@ def run_job(cfg: DictConfig) -> None:
 def _failed(path: Path, error: Exception) -> None:
     """Leave the line and the traceback in the run directory, whoever raised."""
     line = one_line(error, "train")
-    status = run_dir.read_status(path)
+    status = read_status(path)
     with contextlib.suppress(OSError):  # a full disk: the launcher's process finds the run unfinished
         if status.get("state") != "failed" or status.get("pid") != os.getpid():
             with (path / "train.log").open("a", encoding="utf-8") as log:
                 log.write(traceback.format_exc())
-        run_dir.write_status(path, "failed", error=line)
+        write_status(path, "failed", error=line)
 
 
 def _share_machine(cfg: DictConfig) -> None:

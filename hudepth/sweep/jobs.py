@@ -11,10 +11,10 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 
 from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.runs import run_dir
-from hudepth.runs.identity import INCIDENTAL, run_key
-from hudepth.runs.results import flat
-from hudepth.runs.sweeps import FINISHED, folder_name
+from hudepth.runs.identity import INCIDENTAL, flat, run_key
+from hudepth.runs.run import is_run, read_config
+from hudepth.runs.status import FINISHED, read_state
+from hudepth.runs.sweeps import folder_name
 
 VARIANT = "variant"
 SEED = "seed"
@@ -174,7 +174,7 @@ def find_done(jobs: Iterable[Job], folder: Path) -> list[Job]:
     known: dict[str, tuple[Path, dict[str, Any]]] = {}
     for path in paths:
         try:
-            config = run_dir.read_config(path) if run_dir.is_run(path) else {}
+            config = read_config(path) if is_run(path) else {}
             known.setdefault(run_key(config), (path, config))
         except Exception:  # a damaged or foreign folder is nobody's run
             continue
@@ -190,4 +190,4 @@ def find_done(jobs: Iterable[Job], folder: Path) -> list[Job]:
 def _has_all(path: Path, had: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Whether a run is finished, and tested as it is wanted now."""
     tested = not wanted["test"] or (had.get("test") and had.get("protocol") == wanted["protocol"])
-    return bool(run_dir.state(path)[0] == FINISHED and tested)
+    return bool(read_state(path)[0] == FINISHED and tested)

@@ -5,7 +5,6 @@ It reads what runs leave in their directories, so it works for jobs in this proc
 
 from __future__ import annotations
 
-import csv
 import sys
 import threading
 import time
@@ -15,8 +14,9 @@ from types import TracebackType
 from typing import Any
 
 from hudepth.base.console import duration
-from hudepth.runs import run_dir
-from hudepth.runs.sweeps import FAILED, FINISHED, PRUNED
+from hudepth.base.errors import HudepthError
+from hudepth.runs.history import read_history
+from hudepth.runs.status import FAILED, FINISHED, PRUNED, read_status
 from hudepth.sweep.jobs import Job
 
 EVERY_S = 0.5
@@ -104,7 +104,7 @@ class _Watched:
                 self._began = self._began or time.monotonic()
                 return f"epoch {epoch} of {self.epochs}{metric}{self._time_left()}"
         if self._changed("status.json"):
-            status = run_dir.read_status(self.path)
+            status = read_status(self.path)
             self._ended = status.get("state") in (FINISHED, FAILED, PRUNED)
             if self._ended:
                 took = f" in {duration(time.monotonic() - self._began)}" if self._began else ""
@@ -131,9 +131,8 @@ class _Watched:
     def _last_epoch(self) -> tuple[int, str]:
         """Return the last epoch of metrics.csv and the words for its metric."""
         try:
-            with (self.path / "metrics.csv").open(encoding="utf-8", newline="") as file:
-                row = list(csv.DictReader(file))[-1]
-            metric = f", {self.monitor} {float(row[self.monitor]):.4f}" if row.get(self.monitor) else ""
-            return int(row["epoch"]), metric
-        except (OSError, ValueError, KeyError, IndexError, TypeError, csv.Error):
+            row = read_history(self.path / "metrics.csv")[-1]
+        except HudepthError:
             return 0, ""
+        metric = f", {self.monitor} {row[self.monitor]:.4f}" if self.monitor in row else ""
+        return int(row["epoch"]), metric

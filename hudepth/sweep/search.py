@@ -11,8 +11,7 @@ from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Overrid
 
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.options import whole_number
-from hudepth.runs import run_dir
-from hudepth.runs.sweeps import FINISHED, PRUNED
+from hudepth.runs.status import FINISHED, PRUNED, read_state, read_status
 from hudepth.sweep.jobs import Job, find_done
 from hudepth.sweep.progress import say
 from hudepth.training.study import TRIAL_ENV, import_optuna, open_study
@@ -147,8 +146,8 @@ def _spelt(value: Any) -> str:
 def _tell(study: optuna.study.Study, job: Job, folder: Path) -> bool:
     """Tell the study what came of a trial, and return whether anything did; one that was interrupted stays open."""
     optuna_ = import_optuna()
-    state = run_dir.state(folder / job.folder)[0] if job.config is not None else "failed"
-    number, best = int(job.labels["trial"]), run_dir.read_status(folder / job.folder).get("best")
+    state = read_state(folder / job.folder)[0] if job.config is not None else "failed"
+    number, best = int(job.labels["trial"]), read_status(folder / job.folder).get("best")
     if state == FINISHED and isinstance(best, int | float):
         study.tell(number, float(best))
     elif state == PRUNED:

@@ -27,8 +27,8 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.machine import usable_cores
 from hudepth.base.options import plain
 from hudepth.base.wording import one_line
-from hudepth.runs import run_dir
-from hudepth.runs.sweeps import FAILED, FINISHED, PRUNED, read_jobs, write_jobs
+from hudepth.runs.status import FAILED, FINISHED, LOCK, PRUNED, read_state
+from hudepth.runs.sweeps import read_jobs, write_jobs
 from hudepth.sweep.jobs import Job, combine, compose, find_done
 from hudepth.sweep.progress import Progress, say
 
@@ -209,7 +209,7 @@ class Sweep(Sweeper):
 
     def _say_outcome(self, jobs: Sequence[Job], folder: Path) -> tuple[list[str], int]:
         """Say what came of the jobs, and how to go on; return a line for each that failed, and how many did not end."""
-        outcomes = [run_dir.state(folder / job.folder) if job.config else (FAILED, job.error) for job in jobs]
+        outcomes = [read_state(folder / job.folder) if job.config else (FAILED, job.error) for job in jobs]
         states = [state for state, _ in outcomes]
         count = {state: states.count(state) for state in (FINISHED, FAILED, PRUNED)}
         unfinished = len(jobs) - sum(count.values())
@@ -243,7 +243,7 @@ def _held(folder: Path) -> Iterator[None]:
     """Keep a second command from running the same sweep at the same time."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / run_dir.LOCK)
+        lock = FileLock(folder / LOCK)
         lock.acquire(timeout=0)
     except Timeout:
         raise ConfigError(

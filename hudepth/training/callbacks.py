@@ -21,7 +21,7 @@ from hudepth.base.console import duration, log
 from hudepth.base.files import write_text
 from hudepth.data.store import DepthStore
 from hudepth.evaluation.pictures import make_panels
-from hudepth.runs import run_dir
+from hudepth.runs.run import BEST, CHECKPOINTS, LAST
 from hudepth.viz.panels import draw_panels, save_panels
 
 
@@ -239,12 +239,10 @@ def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelChe
         monitor: what the best is judged by.
         mode: ``min`` or ``max``.
     """
-    folder = run / run_dir.CHECKPOINTS
+    folder = run / CHECKPOINTS
     best = KeptCheckpoint(
-        folder, filename=Path(run_dir.BEST).stem, monitor=monitor, mode=mode, save_weights_only=True,
+        folder, filename=Path(BEST).stem, monitor=monitor, mode=mode, save_weights_only=True,
         save_on_train_epoch_end=True, enable_version_counter=False, auto_insert_metric_name=False,
     )  # fmt: skip
-    last = KeptCheckpoint(
-        folder, filename=Path(run_dir.LAST).stem, save_on_train_epoch_end=True, enable_version_counter=False
-    )
+    last = KeptCheckpoint(folder, filename=Path(LAST).stem, save_on_train_epoch_end=True, enable_version_counter=False)
     return [best, last]

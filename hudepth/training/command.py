@@ -21,6 +21,9 @@ from hudepth.base.errors import ConfigError, HudepthError, Pruned
 from hudepth.base.launched import shared_path
 from hudepth.base.options import plain
 from hudepth.runs import run_dir
+from hudepth.runs.environment import environment as run_environment
+from hudepth.runs.run import CHECKPOINTS, LAST
+from hudepth.runs.status import lock_run, write_status
 from hudepth.training.checks import check_config
 from hudepth.training.fit import fit
 from hudepth.training.resume import resumed_config
@@ -58,12 +61,12 @@ def train(cfg: DictConfig) -> float | None:
             key = "variant" if config["variant"] else "sweep_dir"
             raise ConfigError(f"{key}: is of sweeps. Pass +sweep=<name> too, or -m, or leave it out.")
         path = _run_path(config)
-        resumed = [] if (path / run_dir.CHECKPOINTS / run_dir.LAST).is_file() else None  # a job of a sweep that goes on
+        resumed = [] if (path / CHECKPOINTS / LAST).is_file() else None  # a job of a sweep that goes on
     if not is_first_process():
         log.setLevel(logging.WARNING)
-    with _held(path), _shared_with_children(path), run_dir.logged_to(path / "train.log"):
+    with _held(path), _shared_with_children(path), run_dir.log_to_file(path / "train.log"):
         if resumed is None and is_first_process():
-            environment = run_dir.environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
+            environment = run_environment(seed=config["seed"], accelerator=str(config["trainer"]["accelerator"]))
             run_dir.write_start(path, config=config, overrides=overrides, environment=environment)
         return _run(config, path, resumed=resumed)
 
@@ -74,7 +77,7 @@ def _held(path: Path) -> Iterator[None]:
     if not is_first_process():
         yield
         return
-    with run_dir.held(path, timeout_s=HELD_S):
+    with lock_run(path, timeout_s=HELD_S):
         yield
 
 
@@ -89,7 +92,7 @@ def _shared_with_children(path: Path) -> Iterator[None]:
 
 def _status(path: Path, state: str, **more: Any) -> None:
     if is_first_process():
-        run_dir.write_status(path, state, **more)
+        write_status(path, state, **more)
 
 
 def _sweeping() -> bool:

@@ -25,6 +25,7 @@ from hudepth.evaluation.score import score_checkpoint
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint
+from hudepth.runs.run import CHECKPOINTS, LAST
 from hudepth.training.checks import MEMORY_FORMATS, check_input, check_monitor
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
@@ -72,7 +73,7 @@ def fit(config: dict[str, Any], path: Path, *, resumed: list[str] | None, alone:
     )  # fmt: skip
     last = None
     if resumed is not None:
-        last = path / run_dir.CHECKPOINTS / run_dir.LAST
+        last = path / CHECKPOINTS / LAST
         if is_first_process():
             run_dir.write_resumed(path, config=config, overrides=resumed)
     with without_known_warnings():
@@ -94,13 +95,13 @@ def _seen_before(
     """Return what the weights that a run starts from were trained on, and put them into ``net`` if it is a new run."""
     if not resumed:
         return start_from(net, config, datamodule) if config.get("init") else []
-    if epochs := sorted({look["epoch"] for look in run_dir.scored(path)}):
+    if epochs := sorted({look["epoch"] for look in run_dir.read_scored(path)}):
         log.warning(
             "the test images of this run were looked at after epoch %s: if that is why it goes on, its next test "
             "flatters it. metrics.json will say so (scored_before)",
             ", ".join(map(str, epochs)),
         )
-    before: list[dict[str, Any]] = load_checkpoint(str(path / run_dir.CHECKPOINTS / run_dir.LAST)).data.get(BEFORE, [])
+    before: list[dict[str, Any]] = load_checkpoint(str(path / CHECKPOINTS / LAST)).data.get(BEFORE, [])
     return before
 
 

@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import plain
-from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
+from hudepth.runs.run import CHECKPOINTS, LAST, read_config
 
 PARTS = (
     "seed",
@@ -43,11 +43,11 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
         CheckpointError: if it is no run, or has no checkpoint to continue from.
         ConfigError: if something typed cannot change any more.
     """
-    config = run_dir.read_config(path)
+    config = read_config(path)
     lacking = [part for part in PARTS if part not in config]
     if lacking:
         raise CheckpointError(f"resume: '{path}' is no run of hudepth-train: its config.yaml has no '{lacking[0]}'.")
-    last = path / run_dir.CHECKPOINTS / run_dir.LAST
+    last = path / CHECKPOINTS / LAST
     if not last.is_file():
         raise CheckpointError(f"resume: '{path}' has no finished epoch to continue from. Train anew, without resume=.")
     read_plain(last)

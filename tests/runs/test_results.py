@@ -15,7 +15,7 @@ from hudepth.base.errors import DataError
 from hudepth.metrics.summary import ImageTable, per_image_csv
 from hudepth.runs.results import Result, common_images, find_result, merge, paired, stamp_differences
 
-STUDY = Path(__file__).parents[1] / "experiments" / "badcl_official"
+STUDY = Path(__file__).parents[2] / "experiments" / "badcl_official"
 FINGERPRINT = "d22e3bd4"
 SPLIT = "359cc4ee"
 

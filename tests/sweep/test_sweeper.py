@@ -13,7 +13,7 @@ import pytest
 import yaml
 from filelock import FileLock
 
-from hudepth.runs.run_dir import LOCK, held
+from hudepth.runs.status import LOCK, lock_run
 from hudepth.runs.sweeps import read_jobs
 from tests.commands import TINY, Command
 
@@ -285,9 +285,9 @@ def test_a_run_that_another_process_works_on_is_left_to_it(
     assert sweep(command, "loss=l1,l2").code == 0
     run = runs(tmp_path / "s")["l1"]
     (run / "status.json").write_text(json.dumps({"state": "running", "pid": 4711}))
-    with held(run):
+    with lock_run(run):
         done = sweep(command, "loss=l1,l2")
-    assert f"'{run}' is being worked on by another process (number 4711)" in done.err
+    assert f"'{run}' is in use by another process (pid 4711)" in done.err
     assert "sweep tried: 1 finished, 1 unfinished" in done.err
     assert done.code == 1
     assert done.err.splitlines()[-1] == (

@@ -131,7 +131,7 @@ def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
 
 
 def test_resume_refuses_what_it_cannot_do(command: Command, trained: Path, tmp_path: Path) -> None:
-    assert "is no run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
+    assert "is not a run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "config.yaml").write_text("a: 1\n")

@@ -50,7 +50,7 @@ def report_sweep(options: SweepOptions) -> None:
     """
     output = options.output or options.dir / FOLDER
     sweep = read_sweep(options.dir, name=options.name)
-    reports = tuple(f"left alone: '{path}' " for path in (options.dir / FOLDER, output))  # earlier ones
+    reports = tuple(f"skipped: '{path}' " for path in (options.dir / FOLDER, output))  # earlier ones
     sweep = replace(sweep, notes=[note for note in sweep.notes if not note.startswith(reports)])
     rows = sort_runs(sweep, options.protocol, track=lambda runs: track(runs, total=len(runs), what="reading runs"))
     report = _compute(rows, sweep, options)

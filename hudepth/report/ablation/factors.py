@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hudepth.runs.identity import identity
-from hudepth.runs.sweeps import SEEDS
+from hudepth.runs.identity import SEEDS, identity
 from hudepth.viz.style import shorten
 
 TARGET = "_target_"

@@ -18,8 +18,7 @@ from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.rows import Row
 from hudepth.report.ablation.variants import draw_variants
 from hudepth.report.compare import tested_on_training_data
-from hudepth.runs.history import read_history
-from hudepth.runs.run_dir import BEST, CHECKPOINTS, LAST
+from hudepth.runs.run import BEST, CHECKPOINTS, LAST
 from hudepth.viz.panels import save_figure
 
 IMAGES, NETWORKS = 4, 12
@@ -81,7 +80,7 @@ def _curves(report: Report, _config: Mapping[str, Any]) -> Drawn:
     for row in report.rows:
         for each in row.runs.values():
             try:
-                histories.setdefault(row.label, []).append(read_history(each.run.path / "metrics.csv"))
+                histories.setdefault(row.label, []).append(each.run.history())
             except HudepthError as error:
                 log.warning("not in curves.png: %s", error)
     histories = {label: runs for label, runs in histories.items() if runs}

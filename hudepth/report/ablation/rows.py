@@ -11,8 +11,10 @@ from typing import Any
 from hudepth.base.errors import ConfigError, DataError, HudepthError, did_you_mean
 from hudepth.report.ablation.estimates import Contrast, Estimate
 from hudepth.report.ablation.factors import ABSENT, Factor, find_factors, seed_of, variant, variant_key
-from hudepth.runs.results import Result, find_result
-from hudepth.runs.sweeps import FINISHED, Sweep, SweepRun
+from hudepth.runs.results import Result
+from hudepth.runs.run import Run
+from hudepth.runs.status import FINISHED
+from hudepth.runs.sweeps import Sweep
 
 VARIANT = "variant"
 """The label that names a row."""
@@ -37,7 +39,7 @@ class Trouble:
 class Repetition:
     """A finished run with a result."""
 
-    run: SweepRun
+    run: Run
     result: Result
 
 
@@ -98,7 +100,7 @@ class Rows:
     troubles: list[Trouble]
 
 
-def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[SweepRun]], Iterable[SweepRun]] = iter) -> Rows:
+def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[Run]], Iterable[Run]] = iter) -> Rows:
     """Read the results of a sweep's runs and sort them into rows, in the order of the sweep.
 
     Args:
@@ -106,7 +108,7 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[SweepRun]], 
         protocol: of the results to read.
         track: wraps the list of runs, for a progress bar.
     """
-    groups: dict[str, list[tuple[SweepRun, Result | str]]] = {}
+    groups: dict[str, list[tuple[Run, Result | str]]] = {}
     for run in track(sweep.runs):
         groups.setdefault(variant_key(run.config), []).append((run, _result(run, protocol)))
     variants = [_variant([run for run, _ in group]) for group in groups.values()]
@@ -156,17 +158,17 @@ def sort_seeds(seeds: Iterable[str]) -> list[str]:
     return sorted(parts, key=lambda seed: parts[seed])
 
 
-def _result(run: SweepRun, protocol: str) -> Result | str:
+def _result(run: Run, protocol: str) -> Result | str:
     """Return a finished run's result, or why there is none; the text is empty for runs that did not finish."""
     if run.state != FINISHED:
         return ""
     try:
-        return find_result(run.path, protocol)
+        return run.result(protocol)
     except HudepthError as error:
         return str(error)
 
 
-def _variant(runs: Sequence[SweepRun]) -> Variant:
+def _variant(runs: Sequence[Run]) -> Variant:
     names = dict.fromkeys(run.labels[VARIANT] for run in runs if run.labels.get(VARIANT))
     return Variant(variant(runs[0].config), " / ".join(names), seeds=sort_seeds(seed_of(run.config) for run in runs))
 
@@ -186,7 +188,7 @@ def _label(variants: Sequence[Variant], factors: Sequence[Factor]) -> None:
         each.label = label if taken[label] == 1 else f"{label} #{taken[label]}"  # shortened values can look alike
 
 
-def _fill(row: Variant, group: Sequence[tuple[SweepRun, Result | str]]) -> list[Trouble]:
+def _fill(row: Variant, group: Sequence[tuple[Run, Result | str]]) -> list[Trouble]:
     """Give a row the runs that count; return the others."""
     group = sorted(group, key=lambda pair: pair[0].path.name)
     last = {seed_of(run.config): (run, found) for run, found in group if isinstance(found, Result)}

@@ -52,7 +52,7 @@ def test_its_own_report_is_no_foreign_folder(command: Command, sweep: Path) -> N
     (sweep / "foreign").mkdir()
     done = command("report", "sweep", "dir=sweep", "panels=0")
     assert done.code == 0
-    assert [line for line in done.err.splitlines() if line.startswith("left alone")] == [
+    assert [line for line in done.err.splitlines() if line.startswith("skipped")] == [
         line for line in done.err.splitlines() if "sweep/foreign'" in line
     ]
     assert len(json.loads((sweep / "report" / "document.json").read_text())["notes"]) == 1
