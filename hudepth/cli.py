@@ -7,6 +7,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from hudepth.base.errors import ConfigError, did_you_mean
@@ -15,46 +16,6 @@ from hudepth.base.wording import LAUNCHERS, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
 """Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
-
-
-def train() -> int:
-    """Run ``hudepth-train``."""
-    return _main("train")
-
-
-def test() -> int:
-    """Run ``hudepth-test``."""
-    return _main("test")
-
-
-def data() -> int:
-    """Run ``hudepth-data``."""
-    return _main("data")
-
-
-def report() -> int:
-    """Run ``hudepth-report``."""
-    return _main("report")
-
-
-def predict() -> int:
-    """Run ``hudepth-predict``."""
-    return _main("predict")
-
-
-def export() -> int:
-    """Run ``hudepth-export``."""
-    return _main("export")
-
-
-def bench() -> int:
-    """Run ``hudepth-bench``."""
-    return _main("bench")
-
-
-def demo() -> int:
-    """Run ``hudepth-demo``."""
-    return _main("demo")
 
 
 def _main(task: str) -> int:
@@ -84,6 +45,10 @@ def _main(task: str) -> int:
             raise
         print(f"hudepth-{task}: {one_line(error, task)}", file=sys.stderr)
         return 1
+
+
+train, test, data, report, predict, export, bench, demo = (partial(_main, task) for task in COMMANDS)
+"""The console scripts ``hudepth-train`` and so on; each returns an exit code."""
 
 
 def rewrite(task: str, arguments: list[str]) -> list[str]:
