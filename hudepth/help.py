@@ -11,7 +11,7 @@ ABOUT = {
     "report": "Compare two runs, put several or a whole sweep in one table, draw figures, or check the paper's claims.",
     "predict": "Predict depth in metres for images, folders, videos or a camera, with any model file of hudepth's.",
     "export": "Write a checkpoint as ONNX, torch.export, OpenVINO, int8 or a bundle to share, each checked against it.",
-    "bench": "Measure speed and memory of a model on this machine, in every backend, beside other networks.",
+    "bench": "Measure speed and memory of a model on this machine, in every backend.",
     "demo": "Open a page on this machine: drop a picture, see its depth, read distances, turn the point cloud.",
 }
 
@@ -78,10 +78,6 @@ EXAMPLES = {
     "bench": (
         ("hudepth-bench checkpoint=last", "every backend that is installed, batches of 1 to 32"),
         ("hudepth-bench model=hybrid_unet backends=[eager,openvino] batches=[1]", "two backends, random weights"),
-        (
-            "hudepth-bench checkpoint=last peers=true",
-            "beside Depth Anything V2 small, DPT-hybrid, GLPN, a MobileNet UNet",
-        ),
     ),
     "demo": (
         ("hudepth-demo", "at http://127.0.0.1:7860, for this machine alone"),

@@ -76,9 +76,7 @@ def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version
     tested = (ROOT / "constraints.txt").read_text()
     optional = PROJECT["project"]["optional-dependencies"]
     extras = [
-        each
-        for extra in ("dev", "joblib", "slurm", "search", "onnx", "openvino", "demo", "peers")
-        for each in optional[extra]
+        each for extra in ("dev", "joblib", "slurm", "search", "onnx", "openvino", "demo") for each in optional[extra]
     ]
     for requirement in PROJECT["project"]["dependencies"]:
         name = re.split(r"[><=]", requirement)[0]

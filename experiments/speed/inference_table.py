@@ -1,6 +1,6 @@
 """Bring a benchmark's tables here, and its figures at batch 1 and 8 into the README, between its markers.
 
-hudepth-bench checkpoint=<run> peers=true repeats=3 seconds=0.7 output=inference
+hudepth-bench checkpoint=<run> repeats=3 seconds=0.7 output=inference
 python experiments/speed/inference_table.py inference
 """
 

@@ -1,1 +1,1 @@
-"""How fast a model is on this machine, beside what else one could pick."""
+"""How fast a model is on this machine, in every way to run it."""

@@ -1,10 +1,11 @@
-"""hudepth-bench: speed and memory of a model on this machine, in every backend, beside other networks."""
+"""hudepth-bench: speed and memory of a model on this machine, in every backend."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -12,9 +13,9 @@ from omegaconf import DictConfig
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError
 from hudepth.base.options import plain
-from hudepth.bench.field import Field, Subject
-from hudepth.bench.output import Measured, write
+from hudepth.bench.contenders import Contenders
 from hudepth.bench.plan import Plan, make_plan
+from hudepth.bench.report import Measured, write_report
 from hudepth.bench.rounds import Session
 from hudepth.bench.subject import make_subject
 from hudepth.bench.worker import ContenderError
@@ -24,68 +25,73 @@ def bench(cfg: DictConfig) -> None:
     """Measure, print the table, write bench.json, bench.csv, bench.md and bench.png.
 
     Args:
-        cfg: what conf/bench.yaml and the command line compose to.
+        cfg: composed from conf/bench.yaml and the command line.
 
     Raises:
-        HudepthError: with one line for the user; a backend that is missing or fails is none, but a note.
+        HudepthError: with one line for the user; a backend that is missing or fails is a note instead.
     """
     config = plain(cfg)
-    plan, trained = make_plan(config), config["checkpoint"] is not None
-    torch.set_num_threads(plan.threads)
-    with tempfile.TemporaryDirectory(prefix="hudepth-bench-") as made:
-        subject = make_subject(config, Path(made))
-        log.info(
-            "%s of %s parameters, %d x %d, %s; %s; each in a process of its own, threads: %d",
-            subject.name, f"{subject.parameters:,}", *subject.size, "trained" if trained else "random weights",
-            ", ".join(plan.backends), plan.threads,
-        )  # fmt: skip
-        measured = _measure(plan, subject, Path(made), trained=trained)
-    if not measured.session.samples:
-        raise ConfigError(f"nothing could be measured. {' '.join(measured.notes)}")
+    plan = make_plan(config)
+    measured = measure(plan, runs=config["paths"]["runs"])
     try:
-        write(measured)
+        write_report(measured)
     except OSError as error:
         raise ConfigError(
-            f"output: cannot write to '{plan.output}' ({error.strerror or error}). Make space."
+            f"output: cannot write to '{plan.output}' ({error.strerror or error}). Free some space."
         ) from error
 
 
-def _measure(plan: Plan, subject: Subject, folder: Path, *, trained: bool) -> Measured:
-    """Build all contenders, then go round."""
-    session = Session([], plan.batches, plan.repeats, plan.seconds, plan.longest_pass)
+def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda _: None) -> Measured:
+    """Build all contenders, then measure them in turns.
+
+    Args:
+        plan: checked.
+        runs: the folder of runs that ``checkpoint=last`` searches.
+        more: starts further contenders.
+
+    Raises:
+        HudepthError: if the network cannot be built, or nothing could be measured.
+    """
+    assert plan.threads
+    torch.set_num_threads(plan.threads)
+    session = Session(plan.batches, plan.repeats, plan.seconds, plan.longest_pass)
     rates: list[float] = []
-    with Field(subject, folder, plan.threads, plan.device, session.note) as field:
-        count = field.enter(plan.backends, _peers() if plan.peers else ())
-        for _ in track(field.build(), total=count, what="building"):
-            pass
-        session.enter(field.workers)
-        session.only = {entry.name: plan.peer_batches for entry in field.entries if entry.peer}
-        session.before_round = _product(field, session, rates)
-        for _ in track(session.run(), total=session.steps, what="measuring"):
-            pass
-    return Measured(plan, subject, trained, field.entries, session, rates)
+    with tempfile.TemporaryDirectory(prefix="hudepth-bench-") as made:
+        subject = make_subject(plan, Path(made), runs=runs)
+        log.info(
+            "%s of %s parameters, %d x %d, %s; %s; each in a process of its own, threads: %d",
+            subject.name, f"{subject.parameters:,}", *subject.size,
+            "random weights" if plan.checkpoint is None else "trained", ", ".join(plan.backends), plan.threads,
+        )  # fmt: skip
+        with Contenders(subject, Path(made), plan.threads, plan.device, session.note) as contenders:
+            contenders.enter(plan.backends)
+            more(contenders)
+            for _ in track(contenders.build(), total=len(contenders.started), what="building"):
+                pass
+            session.contenders = contenders.workers
+            session.before_round = _measure_product(contenders, session, rates)
+            for _ in track(session.run(), total=session.steps, what="measuring"):
+                pass
+    measured = Measured(plan, subject, contenders.entries, session, rates)
+    if not session.samples:
+        raise ConfigError(f"nothing could be measured. {' '.join(measured.notes)}")
+    return measured
 
 
-def _peers() -> Sequence[str]:
-    from hudepth.bench.peers import PEERS
-
-    return list(PEERS)
-
-
-def _product(field: Field, session: Session, rates: list[float]) -> Callable[[], None]:
-    """Return what adds the rate of a matrix product to ``rates``; once it fails, the table does without."""
+def _measure_product(contenders: Contenders, session: Session, rates: list[float]) -> Callable[[], None]:
+    """Return a function that adds the rate of a matrix product to ``rates``, until that fails."""
     workers = []
     try:
-        workers.append(field.product())
+        workers.append(contenders.product())
     except ContenderError as error:
         session.note("matrix product", f"not measured: {error}")
 
-    def measure() -> None:
+    def measure_rate() -> None:
         for worker in list(workers):
             try:
                 rates.append(worker.matmul_gflop_per_s())
             except ContenderError as error:
                 workers.remove(worker)
-                session.note("matrix product", f"not measured any more: {error}")
+                session.note("matrix product", f"no longer measured: {error}")
 
-    return measure
+    return measure_rate

@@ -1,4 +1,7 @@
-"""Exported graphs for the backends that need one, each made in a process of its own and for one run only."""
+"""Exported graphs: how they are made, each in a process of its own, and run.
+
+PyTorch is not imported at the top, so that the memory of ONNX Runtime and OpenVINO is their own.
+"""
 
 from __future__ import annotations
 
@@ -11,53 +14,88 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.bench.worker import Spec
+from hudepth.bench.worker import Runner, Spec
+from hudepth.inference.runtimes import onnx_session, openvino_model
 
 
-class Exporter:
-    """Has made a file when it is built, and computes nothing."""
-
-    def describe(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
+class GraphRunner(Runner):
+    """Runs a graph on the CPU. This one is only made for the sake of making the graph, and runs nothing."""
 
     def load(self, images: NDArray[np.float32]) -> None:
-        """Nothing to do."""
-
-    def run(self) -> None:
-        """Nothing to do."""
+        """Set the batch of all following passes."""
+        self._images = np.ascontiguousarray(images)
 
     def result(self) -> NDArray[np.float32]:
-        """Nothing."""
-        return np.zeros(0, np.float32)
+        """Return unit depth [b, 1, h, w]."""
+        return np.asarray(self._result)
+
+    def run(self) -> None:
+        """Compute one pass."""
+        self._result: Any = np.zeros(0, np.float32)
 
 
-def onnx(spec: Spec) -> Exporter:
-    """Export the merged form of a network.
+class OnnxRunner(GraphRunner):
+    """ONNX Runtime on the CPU, with the options that hudepth-predict uses.
+
+    Its threads spin for some 20 ms after a pass, which slows the next contender's untimed pass; without spinning, a
+    pass is slower.
+
+    Args:
+        spec: with the option ``graph``, an ONNX file.
+    """
+
+    def __init__(self, spec: Spec) -> None:
+        self._session = onnx_session(Path(spec.options["graph"]), threads=spec.threads)
+        self._input = self._session.get_inputs()[0].name
+
+    def run(self) -> None:
+        """Compute one pass."""
+        (self._result,) = self._session.run(None, {self._input: self._images})
+
+
+class OpenVinoRunner(GraphRunner):
+    """OpenVINO on the CPU, with the options that hudepth-predict uses.
+
+    Args:
+        spec: with the options ``graph``, an ONNX or IR file, and ``precision``.
+    """
+
+    def __init__(self, spec: Spec) -> None:
+        graph, precision = Path(spec.options["graph"]), spec.options["precision"]
+        _, self._request = openvino_model(graph, threads=spec.threads, precision=precision)
+
+    def run(self) -> None:
+        """Compute one pass."""
+        self._result = np.array(self._request.infer({0: self._images}, share_inputs=True)[0])
+
+
+def export(spec: Spec) -> GraphRunner:
+    """Export the merged network to ONNX.
 
     Args:
         spec: of the network, with the further options ``graph`` (file to write), ``name`` and ``max_depth_m``.
     """
-    from hudepth.bench.torch_runners import merged
+    from hudepth.bench.torch_runners import build_merged
     from hudepth.export.graphs import export_onnx
     from hudepth.inference.info import ModelInfo
+    from hudepth.models.cost import parameters
 
-    net, options = merged(spec), spec.options
+    net, options = build_merged(spec), spec.options
     info = ModelInfo(
         name=options["name"], size=options["size"], max_depth_m=options["max_depth_m"],
-        parameters=sum(p.numel() for p in net.parameters()), epoch=0, processing=False,
+        parameters=parameters(net, trainable_only=False), epoch=0, processing=False,
     )  # fmt: skip
     export_onnx(net, Path(options["graph"]), info=info)
-    return Exporter()
+    return GraphRunner()
 
 
-def int8(spec: Spec) -> Exporter:
-    """Quantise a graph for OpenVINO on the images: as fast as any int8 form, but on too few images to be as good.
+def quantise(spec: Spec) -> GraphRunner:
+    """Quantise a graph for OpenVINO: as fast as any int8 graph, but on too few images to be as accurate.
 
     Args:
         spec: with the options ``onnx`` (a graph of normalised images) and ``graph`` (``.xml`` to write).
     """
-    os.environ["CI"] = "true"  # of this process: NNCF then asks nothing and reports nothing
+    os.environ["CI"] = "true"  # in this process: stops NNCF from collecting statistics
     openvino: Any = importlib.import_module("openvino")
     nncf: Any = importlib.import_module("nncf")
     nncf.set_log_level(logging.ERROR)
@@ -67,4 +105,4 @@ def int8(spec: Spec) -> Exporter:
         preset=nncf.QuantizationPreset.MIXED, subset_size=len(images),
     )  # fmt: skip
     openvino.save_model(quantised, spec.options["graph"], compress_to_fp16=False)
-    return Exporter()
+    return GraphRunner()

@@ -1,4 +1,4 @@
-"""What all contenders look at: a few pictures of built-in rooms."""
+"""The input of all contenders: a few images of built-in rooms."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ COUNT = 8
 
 @cache
 def rooms() -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Return :data:`COUNT` pictures, each of another room."""
+    """Return :data:`COUNT` images, each of another room."""
     source = RoomsSource(scenes=COUNT, frames_per_scene=1)
     return [source.read(record).image for record in source.records()]
 
 
 def images_file(folder: Path, size: tuple[int, int]) -> Path:
-    """Return a .npy file of the rooms at a size, normalised, float32 [n, 3, h, w]; it is written if it is not there.
+    """Return a .npy file of the rooms, normalised, float32 [n, 3, h, w]; it is written if it does not exist.
 
     Args:
-        folder: where.
+        folder: to write to.
         size: (height, width).
     """
     path = folder / f"images_{size[0]}x{size[1]}.npy"

@@ -1,4 +1,4 @@
-"""The most memory this process has held at once."""
+"""The peak memory of this process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STATUS = Path("/proc/self/status")
 
 
 def reset_peak() -> bool:
-    """Let the peak start again from what the process holds now; return whether the system can do that."""
+    """Restart the peak from the memory in use now; return whether the system supports that."""
     try:
         CLEAR_REFS.write_text("5", encoding="ascii")
     except OSError:  # another system, or a container that does not allow it
@@ -20,7 +20,7 @@ def reset_peak() -> bool:
 
 
 def peak_mb() -> float:
-    """Return the most memory [MB] resident since :func:`reset_peak`, where that worked, else since the start."""
+    """Return the peak resident memory [MB] since :func:`reset_peak`, or since the start if that is not supported."""
     try:
         found = re.search(r"^VmHWM:\s*(\d+) kB$", STATUS.read_text(encoding="ascii"), re.MULTILINE)
     except OSError:

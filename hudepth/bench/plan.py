@@ -1,92 +1,65 @@
-"""What hudepth-bench is to measure, and how: the options, checked."""
+"""The options of hudepth-bench."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.machine import usable_cores
-from hudepth.base.options import output_folder, whole_number
-from hudepth.bench.backends import check_backends
+from hudepth.base.options import Choice, Range, Size, output_folder, parse
+from hudepth.bench.backends import BACKENDS, REFERENCE
+
+SETTINGS = ("backends", "batches", "repeats", "seconds", "longest_pass", "threads", "device")
+"""The options that bench.json states."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Plan:
-    """What is to be measured, and how."""
+    """What to measure, and how; conf/bench.yaml explains each option."""
 
-    backends: list[str]
-    batches: list[int]
-    peers: bool
-    peer_batches: list[int]
-    repeats: int
-    seconds: float
-    longest_pass: float
-    threads: int
-    device: str
     output: Path
+    backends: list[Annotated[str, Choice(tuple(BACKENDS))]]
+    """In the order of the table, :data:`hudepth.bench.backends.REFERENCE` among them."""
+    batches: list[Annotated[int, Range(1)]]
+    """Rising."""
+    checkpoint: str | None = None
+    model: dict[str, Any] | None = None
+    size: Size | None = None
+    """(height, width)."""
+    repeats: Annotated[int, Range(1)] = 5
+    seconds: Annotated[float, Range(0)] = 1.0
+    longest_pass: Annotated[float, Range(0, above=True)] = 10.0
+    """[s]."""
+    threads: Annotated[int, Range(1)] | None = None
+    device: Annotated[str, Choice(("auto", "cpu", "cuda"))] = "auto"
+    trust: list[str] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.checkpoint is None) == (self.model is None):
+            found = "neither is set" if self.model is None else "both are set"
+            raise ConfigError(
+                f"checkpoint, model: {found}. Pass checkpoint=<file | run directory | last> or model=<name>."
+            )
+        if not self.batches:
+            raise ConfigError("batches: the list is empty. Pass batches=[1,4].")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ConfigError("device: no GPU that CUDA can use here. Pass device=cpu.")
+        if self.device == "auto":
+            self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.backends = [name for name in BACKENDS if name == REFERENCE or name in self.backends]
+        self.batches, self.threads = sorted(set(self.batches)), self.threads or usable_cores()
 
 
 def make_plan(config: dict[str, Any]) -> Plan:
     """Check every option, and that the output folder can be written, before anything is built.
 
-    Args:
-        config: of hudepth-bench.
-
     Raises:
-        ConfigError: for values out of range, or an output folder that cannot be made.
+        ConfigError: for an option of the wrong type or out of range, or an output folder that cannot be made.
     """
-    threads = usable_cores() if config["threads"] is None else whole_number(
-        config, "threads", default=usable_cores(), least=1
-    )  # fmt: skip
-    return Plan(
-        backends=check_backends(config["backends"]),
-        batches=_batches(config["batches"]),
-        peers=bool(config["peers"]),
-        peer_batches=_peer_batches(config),
-        repeats=whole_number(config, "repeats", default=5, least=1),
-        seconds=_seconds(config, "seconds", default=1, zero=True),
-        longest_pass=_seconds(config, "longest_pass", default=10, zero=False),
-        threads=threads,
-        device=_device(str(config["device"])),
-        output=output_folder(config["output"]),
-    )
-
-
-def _batches(value: Any, *, key: str = "batches") -> list[int]:
-    batches = value if isinstance(value, list) else [value]
-    if not batches or not all(type(batch) is int and batch > 0 for batch in batches):
-        raise ConfigError(f"{key}: {value} is no list of positive whole numbers. Pass {key}=[1,4].")
-    return sorted(set(batches))
-
-
-def _peer_batches(config: dict[str, Any]) -> list[int]:
-    batches, wanted = _batches(config["batches"]), _batches(config["peer_batches"], key="peer_batches")
-    chosen = [batch for batch in wanted if batch in batches]
-    if config["peers"] and not chosen:
-        raise ConfigError(
-            f"peer_batches: none of {wanted} is among batches={batches}. Pass peer_batches=[{batches[0]}]."
-        )
-    return chosen
-
-
-def _seconds(config: dict[str, Any], key: str, *, default: float, zero: bool) -> float:
-    value = config[key]
-    good = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < float("inf")
-    if not good or (value == 0 and not zero):
-        raise ConfigError(f"{key}: {value} is no number of seconds. Leave it out for {default}.")
-    return float(value)
-
-
-def _device(name: str) -> str:
-    there = {"cpu": True, "cuda": torch.cuda.is_available()}
-    if name == "auto":
-        return "cuda" if there["cuda"] else "cpu"
-    if not there.get(name):
-        raise ConfigError(
-            f"device: no '{name}' here. Pass device={' or '.join(k for k, here in there.items() if here)}."
-        )
-    return name
+    plan = parse(Plan, config)
+    output_folder(plan.output)
+    return plan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,60 +11,79 @@ from torch import nn
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.instantiate import instantiate
-from hudepth.base.options import size_option
-from hudepth.bench.field import Subject
-from hudepth.bench.torch_runners import operations, parameters
+from hudepth.bench.plan import Plan
+from hudepth.models.cost import image_flops, parameters
 from hudepth.models.inference import inference_form
 
 USUAL_SIZE, USUAL_MAX_DEPTH_M = (224, 224), 10.0
-"""Of a model that no checkpoint says it of."""
+"""Of a model without a checkpoint."""
 
 
-def make_subject(config: dict[str, Any], folder: Path) -> Subject:
-    """Return what is to be measured; its tensors are written to ``folder``.
+@dataclass(frozen=True)
+class Subject:
+    """The network that is measured."""
+
+    name: str
+    """Class of the network."""
+    model: dict[str, Any]
+    """Its configuration."""
+    trust: list[str]
+    state: Path
+    """File of its tensors."""
+    size: tuple[int, int]
+    """(height, width) of its images."""
+    max_depth_m: float
+    """Maximum depth [m]; the network predicts depth / max_depth_m."""
+    parameters: int
+    flops: int
+    """Per image, of the network as trained."""
+    merged_flops: int
+    """Per image, of the form that hudepth-predict and hudepth-test run."""
+
+
+def make_subject(plan: Plan, folder: Path, *, runs: str) -> Subject:
+    """Build the network and write its tensors to ``folder``.
 
     Args:
-        config: of hudepth-bench.
-        folder: that exists.
+        plan: names the checkpoint or the model.
+        folder: existing.
+        runs: the folder of runs that ``checkpoint=last`` searches.
 
     Raises:
-        HudepthError: if there is no such checkpoint, or the network cannot be built or does not take the size.
+        HudepthError: if there is no such checkpoint, or the network cannot be built or does not accept the size.
     """
-    size, trust = size_option(config["size"]), [str(name) for name in config["trust"]]
-    spec, model = config["checkpoint"], config.get("model")
-    if (spec is None) == (model is None):
-        what = "both are set" if model is not None else "neither is set"
-        raise ConfigError(f"checkpoint, model: {what}. Pass checkpoint=<file | run directory | last> or model=<name>.")
-    if spec is not None:
-        net, model, size, max_depth_m = _of_checkpoint(str(spec), config, trust=trust, size=size)
+    trust = plan.trust or []
+    if plan.checkpoint is not None:
+        net, model, size, max_depth_m = _load(plan.checkpoint, runs, trust=trust, size=plan.size)
     else:
+        assert plan.model is not None
         torch.manual_seed(0)
-        net = instantiate(_without_weights(model), trust=trust, only=object if trust else nn.Module).eval()
-        size, max_depth_m = size or USUAL_SIZE, USUAL_MAX_DEPTH_M
+        model, size, max_depth_m = _without_weights(plan.model), plan.size or USUAL_SIZE, USUAL_MAX_DEPTH_M
+        net = instantiate(model, trust=trust, only=object if trust else nn.Module).eval()
     state = folder / "state.pt"
     torch.save(net.state_dict(), state)
     return Subject(
         name=type(net).__name__, model=_without_weights(model), trust=trust, state=state, size=size,
-        max_depth_m=max_depth_m, parameters=parameters(net), flops=operations(net, size),
-        merged_flops=operations(inference_form(net, size=size), size),
+        max_depth_m=max_depth_m, parameters=parameters(net, trainable_only=False), flops=image_flops(net, size),
+        merged_flops=image_flops(inference_form(net, size=size), size),
     )  # fmt: skip
 
 
-def _of_checkpoint(
-    spec: str, config: dict[str, Any], *, trust: list[str], size: tuple[int, int] | None
+def _load(
+    checkpoint: str, runs: str, *, trust: list[str], size: tuple[int, int] | None
 ) -> tuple[nn.Module, dict[str, Any], tuple[int, int], float]:
-    """Return network, its configuration, size and what unit depth 1 stands for."""
+    """Return network, configuration, size and maximum depth [m]."""
     from hudepth.inference.backends import EXPORTED, info_of
-    from hudepth.runs.checkpoint import load_checkpoint  # takes seconds, which random weights need not wait for
+    from hudepth.runs.checkpoint import load_checkpoint  # slow to import, and random weights do not need it
 
-    if Path(spec).suffix.lower() in EXPORTED:
-        raise ConfigError("checkpoint: exported files are made here. Pass the checkpoint or bundle it came from.")
-    checkpoint = load_checkpoint(spec, runs=config["paths"]["runs"])
-    net = checkpoint.build_net(trust=trust)
-    info = info_of(checkpoint, parameters=parameters(net), size=size)
-    return net, checkpoint.config["model"], info.size, info.max_depth_m
+    if Path(checkpoint).suffix.lower() in EXPORTED:
+        raise ConfigError("checkpoint: exported files are not accepted. Pass the checkpoint or bundle they came from.")
+    loaded = load_checkpoint(checkpoint, runs=runs)
+    net = loaded.build_net(trust=trust)
+    info = info_of(loaded, parameters=parameters(net, trainable_only=False), size=size)
+    return net, loaded.config["model"], info.size, info.max_depth_m
 
 
-def _without_weights(model: Any) -> dict[str, Any]:
-    """Return a model's configuration without what it starts from: its tensors are given."""
+def _without_weights(model: dict[str, Any]) -> dict[str, Any]:
+    """Drop the initial weights from a model's configuration: the tensors come from a file."""
     return {**model, **({"weights": None} if "weights" in model else {})}

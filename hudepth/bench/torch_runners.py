@@ -1,11 +1,9 @@
-"""The backends in PyTorch: the same network, laid out and merged in different ways."""
+"""The backends in PyTorch: the same network in different layouts and forms."""
 
 from __future__ import annotations
 
-import copy
 import os
 import time
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,38 +11,33 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hudepth.base.instantiate import instantiate
-from hudepth.bench.worker import Spec
-from hudepth.models.cost import counted_flops
+from hudepth.bench.worker import Runner, Spec
 from hudepth.models.inference import inference_form
 
 MATRIX, PRODUCTS = 2048, 3
-"""Side of the matrices whose product is the machine's measure, and how many products are timed."""
+"""Side of the matrices whose product measures the machine, and how many products are timed."""
 
 
-class TorchRunner:
+class TorchRunner(Runner):
     """A network in inference mode.
 
     Args:
         net: image [b, 3, h, w] to depth, in evaluation mode.
         device: where it runs.
-        channels_last: how images are laid out.
+        channels_last: the memory layout of images.
     """
 
     def __init__(self, net: nn.Module, *, device: torch.device, channels_last: bool) -> None:
         self.net, self.device, self.channels_last = net.to(device), device, channels_last
 
-    def describe(self) -> dict[str, Any]:
-        """Nothing that is not known from elsewhere."""
-        return {}
-
     def load(self, images: NDArray[np.float32]) -> None:
-        """Take the batch of all passes from now on."""
+        """Set the batch of all following passes."""
         layout = torch.channels_last if self.channels_last else torch.contiguous_format
         self.images = torch.from_numpy(images).to(self.device).contiguous(memory_format=layout)
 
     @torch.inference_mode()
     def run(self) -> None:
-        """Compute a pass."""
+        """Compute one pass."""
         self.output = self.net(self.images)
         self._wait()
 
@@ -53,13 +46,14 @@ class TorchRunner:
         return np.asarray(self.output.float().cpu().numpy())
 
     def reset_peak(self) -> None:
-        """Count a GPU's memory anew."""
+        """Restart the peak of the memory, and of a GPU's."""
+        super().reset_peak()
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
 
-    def peak_mb(self) -> float | None:
-        """Return the most memory of a GPU [MB] that tensors took; None without one."""
-        return torch.cuda.max_memory_allocated(self.device) / 1e6 if self.device.type == "cuda" else None
+    def peak_mb(self) -> float:
+        """Return the peak memory [MB]: on a GPU of its tensors, else of the process."""
+        return torch.cuda.max_memory_allocated(self.device) / 1e6 if self.device.type == "cuda" else super().peak_mb()
 
     def _wait(self) -> None:
         if self.device.type == "cuda":
@@ -67,10 +61,10 @@ class TorchRunner:
 
 
 class CompiledRunner(TorchRunner):
-    """A network compiled for each batch size by itself: PyTorch gives up after eight shapes of one."""
+    """A network compiled from scratch for each batch size: PyTorch gives up after eight shapes of one function."""
 
     def load(self, images: NDArray[np.float32]) -> None:
-        """Take a batch, and forget what was compiled for others."""
+        """Set the batch, and discard what was compiled for others."""
         super().load(images)
         torch.compiler.reset()
         self.plain = getattr(self, "plain", self.net)
@@ -78,7 +72,7 @@ class CompiledRunner(TorchRunner):
 
 
 class ProductRunner(TorchRunner):
-    """The product of two single-precision matrices, the measure of the machine."""
+    """The product of two single-precision matrices, which measures the machine."""
 
     @torch.inference_mode()
     def matmul_gflop_per_s(self) -> float:
@@ -95,35 +89,30 @@ class ProductRunner(TorchRunner):
 
 
 def product(spec: Spec) -> ProductRunner:
-    """The machine's measure, in a process of its own so that no network's memory holds the matrices."""
+    """Measure the machine, in a process of its own so that the matrices do not count as a network's memory."""
     torch.set_num_threads(spec.threads)
     return ProductRunner(nn.Identity(), device=_device(spec), channels_last=False)
 
 
-def eager(spec: Spec) -> TorchRunner:
-    """The network as it was trained, contiguous."""
-    return TorchRunner(build_net(spec), device=_device(spec), channels_last=False)
+def network(spec: Spec) -> TorchRunner:
+    """Run the network.
 
-
-def channels_last(spec: Spec) -> TorchRunner:
-    """The network as it was trained, channels-last."""
-    net = build_net(spec).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return TorchRunner(net, device=_device(spec), channels_last=True)
-
-
-def default(spec: Spec) -> TorchRunner:
-    """The form that predicting and testing use."""
-    return TorchRunner(merged(spec), device=_device(spec), channels_last=True)
-
-
-def compiled(spec: Spec) -> CompiledRunner:
-    """The same form through ``torch.compile``."""
-    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # else it keeps processes that would wait beside the others
-    return CompiledRunner(merged(spec), device=_device(spec), channels_last=True)
+    Args:
+        spec: as for :func:`build_net`, with the further options ``merged`` (as hudepth-predict and hudepth-test run
+            it), ``channels_last`` and ``compile``.
+    """
+    device, channels_last = _device(spec), bool(spec.options.get("channels_last"))
+    net = build_merged(spec) if spec.options.get("merged") else build_net(spec)
+    if spec.options.get("compile"):
+        os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # else it keeps idle processes alive
+        return CompiledRunner(net, device=device, channels_last=channels_last)
+    if channels_last:
+        net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return TorchRunner(net, device=device, channels_last=channels_last)
 
 
 def build_net(spec: Spec) -> nn.Module:
-    """Build the network of a specification with the weights it names, in evaluation mode.
+    """Build the network in evaluation mode.
 
     Args:
         spec: with the options ``model``, ``trust`` and ``state`` (file of its tensors).
@@ -134,26 +123,10 @@ def build_net(spec: Spec) -> nn.Module:
     return net.eval()
 
 
-def merged(spec: Spec) -> nn.Module:
-    """Build the form that predicting and testing use."""
+def build_merged(spec: Spec) -> nn.Module:
+    """Build the merged network."""
     height, width = spec.options["size"]
     return inference_form(build_net(spec), size=(height, width))
-
-
-def parameters(net: nn.Module) -> int:
-    """Return how many parameters a network has."""
-    return sum(parameter.numel() for parameter in net.parameters())
-
-
-def operations(net: nn.Module, size: tuple[int, int]) -> int:
-    """Return the operations of an image by PyTorch's counter, without computing them.
-
-    Args:
-        net: in any form; it is not changed.
-        size: (height, width) of the image.
-    """
-    weightless = copy.deepcopy(net).to("meta").requires_grad_(requires_grad=True)  # else fused attention is missed
-    return counted_flops(weightless, torch.empty(1, 3, *size, device="meta"))
 
 
 def _device(spec: Spec) -> torch.device:

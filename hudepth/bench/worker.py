@@ -1,4 +1,4 @@
-"""A contender in a process of its own: own threads, own memory, silent until it is asked."""
+"""A contender in a process of its own: own threads, own memory, idle until it gets a command."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,50 +20,58 @@ from numpy.typing import NDArray
 from hudepth.bench.memory import peak_mb, reset_peak
 
 LIMIT_S = 900
-"""How long an answer may take; compiling a large network for a batch size takes a minute or two."""
+"""The longest wait for an answer; compiling a large network for a batch size takes a minute or two."""
 
 
 class ContenderError(Exception):
-    """A contender could not go on; its message says why, for a note under the table."""
+    """A contender failed; the message says why, for a note under the table."""
 
 
 @dataclass(frozen=True)
 class Spec:
-    """What a process is to run."""
+    """What a process runs."""
 
     name: str
     factory: str
     """``module:function`` that takes this specification and returns a :class:`Runner`."""
     images: Path
-    """A .npy file of normalised images, float32 [n, 3, h, w]; a batch is the first of them, over and over."""
+    """A .npy file of normalised images, float32 [n, 3, h, w]; a batch repeats them as often as it needs."""
     threads: int
     options: dict[str, Any] = field(default_factory=dict)
-    """What else the factory wants."""
+    """Further arguments of the factory."""
 
 
-class Runner(Protocol):
+class Runner:
     """What a contender computes with."""
 
     def describe(self) -> dict[str, Any]:
-        """Return what only the process knows: of peers ``parameters``, ``flops`` and ``layout``."""
-        ...
+        """Return what only the process knows."""
+        return {}
 
     def load(self, images: NDArray[np.float32]) -> None:
-        """Take the batch [b, 3, h, w] that all passes from now on are of, in whatever layout suits."""
-        ...
+        """Set the batch [b, 3, h, w] of all following passes, in whatever layout suits."""
+        raise NotImplementedError
 
     def run(self) -> None:
-        """Compute a pass; it is over when this returns."""
-        ...
+        """Compute one pass; it is finished when this returns."""
+        raise NotImplementedError
 
     def result(self) -> NDArray[np.float32]:
-        """Return what the last pass gave."""
-        ...
+        """Return the output of the last pass."""
+        raise NotImplementedError
+
+    def reset_peak(self) -> None:
+        """Restart the peak of the memory."""
+        reset_peak()
+
+    def peak_mb(self) -> float:
+        """Return the peak memory [MB]."""
+        return peak_mb()
 
 
 @dataclass(frozen=True)
 class Begun:
-    """What the first pass at a batch size told."""
+    """The first pass at a batch size."""
 
     first_pass_s: float
     """Compiling and allocating included."""
@@ -75,7 +82,7 @@ class Worker:
     """The parent's end of a process; use as a context manager.
 
     Args:
-        spec: what it runs. It starts to import what that needs at once; all else waits for a command.
+        spec: what it runs. It starts importing at once; everything else waits for a command.
         log: file for whatever its libraries print.
     """
 
@@ -85,7 +92,7 @@ class Worker:
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=serve, args=(theirs, spec, log), daemon=True)
         self._process.start()
-        theirs.close()  # so that its end is noticed
+        theirs.close()  # so that the end of the process closes the pipe
 
     def __enter__(self) -> Worker:
         return self
@@ -94,41 +101,37 @@ class Worker:
         self.close()
 
     def build(self) -> dict[str, Any]:
-        """Build the runner; return what it says of itself.
+        """Build the runner; return its description.
 
         Raises:
             ContenderError: if it fails, as with all commands.
         """
-        described: dict[str, Any] = self._ask("build")
-        return described
+        return dict(self._ask("build"))
 
     def begin(self, batch: int) -> Begun:
-        """Turn to a batch size: two untimed passes, and memory is counted anew."""
+        """Switch to a batch size: two untimed passes; the peak memory restarts."""
         begun: Begun = self._ask("begin", batch)
         return begun
 
     def turn(self, seconds: float) -> list[float]:
-        """Return times [s] of passes: one untimed, then as many as fit into ``seconds``, at least one."""
-        times: list[float] = self._ask("turn", seconds)
-        return times
+        """Return the times [s] of passes: one untimed, then as many as fit into ``seconds``, at least one."""
+        return list(self._ask("turn", seconds))
 
     def peak_mb(self) -> float:
-        """Return the most memory [MB] held since the last :meth:`begin`."""
-        peak: float = self._ask("peak_mb")
-        return peak
+        """Return the peak memory [MB] since the last :meth:`begin`."""
+        return float(self._ask("peak_mb"))
 
     def matmul_gflop_per_s(self) -> float:
-        """Return the best rate of several products of matrices, where that is what the process is for."""
-        rate: float = self._ask("matmul_gflop_per_s")
-        return rate
+        """Return the best rate of several matrix products; only for :data:`hudepth.bench.backends.PRODUCT`."""
+        return float(self._ask("matmul_gflop_per_s"))
 
     def dismiss(self) -> None:
-        """Let the process end after what it is doing, without waiting for it."""
+        """Let the process end after its current command, without waiting for it."""
         with suppress(OSError):
             self._pipe.send(("close",))
 
     def close(self) -> None:
-        """End the process, whatever it is doing; a second time does nothing."""
+        """End the process, whatever it is doing; calling it again does nothing."""
         self.dismiss()
         self._process.join(2)
         if self._process.is_alive():
@@ -144,13 +147,13 @@ class Worker:
             good, value = self._pipe.recv()
         except (EOFError, OSError) as error:
             self._process.join(5)
-            raise ContenderError(_end(self._process.exitcode)) from error
+            raise ContenderError(_describe_exit(self._process.exitcode)) from error
         if not good:
             raise ContenderError(value)
         return value
 
 
-def _end(code: int | None) -> str:
+def _describe_exit(code: int | None) -> str:
     if code is not None and code < 0:
         with suppress(ValueError):
             killed = signal.Signals(-code).name
@@ -159,27 +162,26 @@ def _end(code: int | None) -> str:
 
 
 def serve(pipe: Connection, spec: Spec, log: Path) -> None:
-    """Answer commands until the parent says ``close`` or is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent sees to its workers
+    """Answer commands until the parent sends ``close`` or ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
     _silence(log)
     server = _Server(spec)
     with suppress(EOFError, OSError):
         while (message := pipe.recv())[0] != "close":
             try:
-                answer: Callable[..., Any] = getattr(server, message[0])
-                pipe.send((True, answer(*message[1:])))
+                pipe.send((True, getattr(server, message[0])(*message[1:])))
             except Exception as error:
-                pipe.send((False, said(error)))
+                pipe.send((False, summarise_error(error)))
 
 
-def said(error: BaseException) -> str:
-    """Return an error in one line of moderate length."""
+def summarise_error(error: BaseException) -> str:
+    """Return an error as one line of at most 200 characters."""
     first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
     return f"{type(error).__name__}: {first}"[:200] if first else type(error).__name__
 
 
 def _silence(log: Path) -> None:
-    """Send what is printed, by libraries in other languages, too, to a file."""
+    """Redirect whatever is printed to a file, by libraries in other languages too."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
@@ -198,7 +200,7 @@ class _Server:
         self.failed: Exception | None = None
         try:
             self.module = importlib.import_module(module)
-        except Exception as error:  # told when the first command asks for it
+        except Exception as error:  # reported by build
             self.failed = error
 
     def build(self) -> dict[str, Any]:
@@ -210,29 +212,26 @@ class _Server:
         return described
 
     def begin(self, batch: int) -> Begun:
-        images = self.images[np.arange(batch) % len(self.images)]
-        reset_peak()
-        getattr(self.runner, "reset_peak", lambda: None)()
-        self.runner.load(images)
-        first = self._timed()
+        self.runner.reset_peak()
+        self.runner.load(self.images[np.arange(batch) % len(self.images)])
+        first = self._time_pass()
         self.runner.run()
         return Begun(first, self.runner.result())
 
     def turn(self, seconds: float) -> list[float]:
         self.runner.run()
-        times = [self._timed()]
+        times = [self._time_pass()]
         while sum(times) < seconds:
-            times.append(self._timed())
+            times.append(self._time_pass())
         return times
 
     def peak_mb(self) -> float:
-        own = getattr(self.runner, "peak_mb", None)  # of a GPU
-        return float((own and own()) or peak_mb())
+        return self.runner.peak_mb()
 
     def matmul_gflop_per_s(self) -> float:
         return float(self.runner.matmul_gflop_per_s())  # type: ignore[attr-defined]
 
-    def _timed(self) -> float:
+    def _time_pass(self) -> float:
         start = time.perf_counter()
         self.runner.run()
         return time.perf_counter() - start

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
@@ -23,6 +25,17 @@ def counted_flops(network: nn.Module, image: Tensor) -> int:
     return int(counter.get_total_flops())
 
 
-def parameters(module: nn.Module) -> int:
-    """Return the number of values in a module that training changes."""
-    return sum(value.numel() for value in module.parameters() if value.requires_grad)
+def image_flops(network: nn.Module, size: tuple[int, int]) -> int:
+    """Return the FLOPs of one image by :func:`counted_flops`, without computing anything.
+
+    Args:
+        network: in any form, frozen or not; it is not changed.
+        size: (height, width) of the image.
+    """
+    weightless = copy.deepcopy(network).to("meta").requires_grad_(requires_grad=True)
+    return counted_flops(weightless, torch.empty(1, 3, *size, device="meta"))
+
+
+def parameters(module: nn.Module, *, trainable_only: bool = True) -> int:
+    """Return the number of values in a module that training changes, or of all its parameters."""
+    return sum(value.numel() for value in module.parameters() if value.requires_grad or not trainable_only)

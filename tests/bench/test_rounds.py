@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from hudepth.bench.rounds import Session
-from hudepth.bench.worker import Begun, ContenderError
+from hudepth.bench.worker import Begun, ContenderError, Worker
 
 CALLS = list[tuple[str, str, float]]
 
 
-class Fake:
+class Fake(Worker):
     """Takes the same time for every image, and fails when it is told to."""
 
     def __init__(self, name: str, calls: CALLS, *, image_s: float = 0.1, fails: tuple[str, int] | None = None) -> None:
@@ -36,7 +36,7 @@ class Fake:
 
 
 def measured(*fakes: Fake, batches: tuple[int, ...] = (1, 2), repeats: int = 3, **options: object) -> Session:
-    session = Session(fakes, batches, repeats, 0.25, 10.0, **options)  # type: ignore[arg-type]
+    session = Session(batches, repeats, 0.25, 10.0, fakes, **options)  # type: ignore[arg-type]
     for _ in session.run():
         pass
     return session
@@ -56,7 +56,7 @@ def test_all_take_turns_forth_and_back() -> None:
 
 def test_batches_follow_one_another_and_every_step_is_told() -> None:
     calls: CALLS = []
-    session = Session([Fake("a", calls), Fake("b", calls)], [1, 2], 3, 0.1, 10.0)
+    session = Session([1, 2], 3, 0.1, 10.0, [Fake("a", calls), Fake("b", calls)])
     assert sum(1 for _ in session.run()) == session.steps == 16
     assert [(sample.name, sample.batch) for sample in session.samples] == [("a", 1), ("b", 1), ("a", 2), ("b", 2)]
 
@@ -84,10 +84,3 @@ def test_passes_that_would_take_too_long_are_left_out() -> None:
     assert session.notes == {"slow": ["not measured at batch 4, where a pass would take about 16 s"]}
     assert [sample.batch for sample in session.samples if sample.name == "fast"] == [1, 2, 4]
     assert [sample.batch for sample in session.samples if sample.name == "slow"] == [1, 2]
-
-
-def test_some_are_measured_at_some_batches_alone() -> None:
-    calls: CALLS = []
-    session = measured(Fake("a", calls), Fake("peer", calls), batches=(1, 2, 4), only={"peer": [2]})
-    assert [(sample.name, sample.batch) for sample in session.samples if sample.name == "peer"] == [("peer", 2)]
-    assert session.notes == {}

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
-import csv
-import io
+import math
+import statistics
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.bench.rounds import Sample
-from hudepth.bench.rows import Entry, Row, comparisons, efficiency, make_rows, plain
-from hudepth.bench.tables import csv_text, label, markdown, terminal_table
+from hudepth.bench.rows import Entry, Row, describe_efficiency, make_rows, quantiles_ms, times_as_fast
 
-SIZE = (224, 224)
+TIMES = st.floats(1e-5, 1e3)
+ROUNDS: Any = st.lists(st.lists(TIMES, min_size=1, max_size=7), min_size=1, max_size=5)
 
 
 def sample(name: str, batch: int, pass_s: float, *, depth: float = 0.5) -> Sample:
@@ -22,20 +23,14 @@ def sample(name: str, batch: int, pass_s: float, *, depth: float = 0.5) -> Sampl
     return Sample(name, batch, 1.0, result, [[pass_s, pass_s], [pass_s]], 100.0)
 
 
-def entry(name: str, *, peer: bool = False, size: tuple[int, int] = SIZE) -> Entry:
-    own = f"{name}, {size[0]} x {size[1]}" if peer else name
-    return Entry(own, name, size, peer, 1000, 2_000_000_000, "")
+def entry(name: str) -> Entry:
+    return Entry(name, name, (224, 224), "", 1000, 2_000_000_000)
 
 
 def rows_of(**passes_s: float) -> list[Row]:
     """Backends at batch 1, by the seconds of a pass."""
     samples = [sample(name, 1, pass_s) for name, pass_s in passes_s.items()]
     return make_rows(samples, [entry(name) for name in passes_s], peak_gflop_per_s=100.0, max_depth_m=10.0)
-
-
-def peer_row(name: str, size: tuple[int, int], images_per_s: float) -> Row:
-    row = replace(rows_of(eager=1 / images_per_s)[0], contender=name, kind="peer", height=size[0], width=size[1])
-    return replace(row, difference_mm=None, times_eager=images_per_s / 10)
 
 
 def test_a_row_from_its_times() -> None:
@@ -79,44 +74,47 @@ def test_a_depth_that_is_no_number_is_not_exact() -> None:
 def test_efficiency_is_of_the_fastest_exact_backend() -> None:
     rows = rows_of(eager=0.1, openvino=0.05, int8=0.01)
     rows[2] = replace(rows[2], difference_mm=30.0)
-    line = efficiency(rows, peak_gflop_per_s=100.0, merged_flops=1_500_000_000)
+    line = describe_efficiency(rows, peak_gflop_per_s=100.0, merged_flops=1_500_000_000)
     assert line == (
         "Fastest exact backend at batch 1: openvino, 20.0 images/s, 40 nominal GFLOP/s, 40 % of the 100 GFLOP/s of a "
-        "single-precision matrix product here; of the 1.50 GFLOP that are left when it is merged, 30 GFLOP/s or 30 %."
+        "single-precision matrix product here; of the 1.50 GFLOP that remain when it is merged, 30 GFLOP/s or 30 %."
     )
-    assert efficiency(rows, peak_gflop_per_s=None, merged_flops=1) == ""
-    assert "merged" not in efficiency(rows[:1], peak_gflop_per_s=100.0, merged_flops=1_500_000_000)
+    assert describe_efficiency(rows, peak_gflop_per_s=None, merged_flops=1) == ""
+    assert "merged" not in describe_efficiency(rows[:1], peak_gflop_per_s=100.0, merged_flops=1_500_000_000)
 
 
-def test_peers_are_put_beside_this_model_in_words() -> None:
-    rows = rows_of(eager=0.1, default=0.08, openvino=0.04)  # 10, 12.5 and 25 images/s
-    rows += [peer_row("Small", SIZE, 11.0), peer_row("Small", (480, 640), 1.0), peer_row("Large", (384, 384), 5.0)]
-    assert comparisons(rows, size=SIZE) == [
-        "Images/s at batch 1 over those of this model at 224:",
-        "Small (random weights, eager): at 224 1.10 x eager and 0.88 x default; at 480 x 640 0.10 x eager and 0.08 x "
-        "default.",
-        "Large (random weights, eager): at 384 0.50 x eager and 0.40 x default.",
-        "Of the peers, at the size nearest to this model's: Small is faster than eager; none is faster than default; "
-        "none is faster than openvino.",
-    ]
-    assert comparisons(rows[:3], size=SIZE) == []
+def quantile(values: list[float], share: float) -> float:
+    """By the definition: the value at place share (n - 1) of the sorted ones, straight lines in between."""
+    ordered = sorted(values)
+    place = share * (len(ordered) - 1)
+    below = math.floor(place)
+    above = min(below + 1, len(ordered) - 1)
+    return ordered[below] + (place - below) * (ordered[above] - ordered[below])
 
 
-def test_tables_say_what_the_rows_say() -> None:
-    rows = [*rows_of(eager=0.1, default=0.08), peer_row("Small", (480, 640), 1234.5)]
-    assert [label(row) for row in rows] == ["eager", "default", "Small, 480 x 640"]
-    assert label(peer_row("Small", (518, 518), 1.0)) == "Small, 518"
-    read = list(csv.DictReader(io.StringIO(csv_text(rows))))
-    for text, row in zip(read, rows, strict=True):
-        assert text == {key: "" if value is None else str(value) for key, value in plain(row).items()}
-    machine = {
-        "processor": "P", "cores": 4, "usable_cores": 2, "memory_gb": 8.2, "instruction_sets": ["avx2"],
-        "system": "Linux", "python": "3.11", "packages": {"torch": "2.6", "openvino": None},
-    }  # fmt: skip
-    page = markdown(rows, title="T", machine=machine, sentences=["A."], notes=["n"])
-    assert "On P, 4 cores of which 2 may be used, 8 GB, avx2; Linux, Python 3.11, torch 2.6." in page
-    table = [line for line in page.splitlines() if line.startswith("|")]
-    assert len({line.count("|") for line in table}) == 1
-    assert "| 1 | Small, 480 x 640 | 0.81 | 1234 |" in page
-    assert page.endswith("- A.\n- n\n")
-    assert terminal_table(rows, title="T").row_count == 3
+@given(ROUNDS)
+def test_quantiles_are_of_all_passes(rounds: list[list[float]]) -> None:
+    passes, *found = quantiles_ms(rounds)
+    times = [1000 * time for own in rounds for time in own]
+    assert passes == len(times)
+    assert found == pytest.approx([quantile(times, share) for share in (0.25, 0.5, 0.75, 0.95)])
+    assert found[1] == pytest.approx(statistics.median(times))
+    assert found == sorted(found)
+
+
+@given(ROUNDS, st.floats(0.1, 10))
+def test_a_thing_is_as_many_times_as_fast_as_its_passes_are_shorter(rounds: list[list[float]], factor: float) -> None:
+    slower = [[factor * time for time in own] for own in rounds]
+    assert times_as_fast(rounds, slower) == pytest.approx(factor)
+    assert times_as_fast(slower, rounds) == pytest.approx(1 / factor)
+
+
+@given(st.lists(st.tuples(TIMES, st.floats(0.1, 10)), min_size=1, max_size=9))
+def test_what_slows_both_in_a_round_does_not_count(slowed: list[tuple[float, float]]) -> None:
+    reference = [[time * drift] for time, drift in slowed]
+    own = [[time * drift / 3] for time, drift in slowed]
+    assert times_as_fast(own, reference) == pytest.approx(3)
+
+
+def test_one_bad_round_of_three_does_not_count() -> None:
+    assert times_as_fast([[1.0], [1.0], [50.0]], [[2.0], [2.0], [2.0]]) == 2

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from hudepth.bench.memory import reset_peak
-from hudepth.bench.worker import ContenderError, Spec, Worker, said
+from hudepth.bench.worker import ContenderError, Spec, Worker, summarise_error
 
 FAKES = """
 import os, signal, time
 import numpy as np
+from hudepth.bench import worker
 
-class Runner:
+class Runner(worker.Runner):
     def __init__(self, spec):
         self.spec, self.passes = spec, 0
         print("talk")
@@ -147,6 +148,6 @@ def test_peak_is_in_megabytes() -> None:
 
 
 def test_errors_are_one_moderate_line() -> None:
-    assert said(ValueError()) == "ValueError"
-    assert said(ValueError("\n \n a \nb")) == "ValueError: a"
-    assert len(said(ValueError("x" * 1000))) == 200
+    assert summarise_error(ValueError()) == "ValueError"
+    assert summarise_error(ValueError("\n \n a \nb")) == "ValueError: a"
+    assert len(summarise_error(ValueError("x" * 1000))) == 200

@@ -5,9 +5,9 @@ import importlib.util
 import pytest
 import torch
 
-from hudepth.bench.mobile_unet import ENCODER, MobileUNet
-from hudepth.bench.peers import PEERS
-from hudepth.bench.torch_runners import operations, parameters
+from experiments.speed.mobile_unet import ENCODER, MobileUNet
+from experiments.speed.peers import PEERS
+from hudepth.models.cost import image_flops, parameters
 
 PUBLISHED_MILLIONS = {
     "Depth Anything V2 small": 24.8,
@@ -18,6 +18,7 @@ PUBLISHED_MILLIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PEERS)
 def test_peers_have_their_size_and_answer_at_every_size_they_are_asked_at(name: str) -> None:
     peer = PEERS[name]
@@ -55,6 +56,6 @@ def test_mobile_unet_by_hand() -> None:
         channels, side = wider, 2 * side
     count, cost = count + 33, cost + 32 * 224**2
     assert parameters(net) == count == 3_960_929
-    assert operations(net, (224, 224)) == 2 * cost
+    assert image_flops(net, (224, 224)) == 2 * cost
     with torch.inference_mode():
         assert net(torch.rand(2, 3, 64, 96)).shape == (2, 1, 64, 96)

@@ -1,4 +1,4 @@
-"""Networks that one could pick instead, built from their published configurations with random weights: speed only."""
+"""Other networks to compare speed with, built from their published configurations with random weights."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hudepth.bench.mobile_unet import MobileUNet
-from hudepth.bench.torch_runners import TorchRunner, operations, parameters
+from experiments.speed.mobile_unet import MobileUNet
+from hudepth.bench.torch_runners import TorchRunner
 from hudepth.bench.worker import Spec
+from hudepth.models.cost import image_flops, parameters
 
 Size = tuple[int, int]
 """(height, width)."""
@@ -27,16 +28,16 @@ class Peer:
 
     build: Callable[[Size], nn.Module]
     native: Size
-    """What it was published with."""
+    """The size it was published with."""
     multiple: int
-    """Of which its sides must be multiples."""
+    """Its sides must be multiples of this."""
     square: bool = False
     """Whether height must be width."""
     package: str | None = "transformers"
-    """That builds it."""
+    """The package that builds it."""
 
     def nearest(self, size: Size) -> Size:
-        """Return the size it takes that is nearest to ``size``."""
+        """Return the accepted size nearest to ``size``."""
         if self.square:
             size = (round(math.sqrt(size[0] * size[1])),) * 2
         height, width = (max(1, round(side / self.multiple)) * self.multiple for side in size)
@@ -44,7 +45,7 @@ class Peer:
 
 
 class _Depth(nn.Module):
-    """Image to depth, of a model that answers with more than that."""
+    """A model of transformers, reduced to image in, depth out."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
@@ -111,11 +112,11 @@ class PeerRunner(TorchRunner):
         self._choose_layout(np.load(spec.images)[:1])
 
     def describe(self) -> dict[str, Any]:
-        """Return parameters, operations of an image and the layout chosen."""
-        return {
-            "parameters": parameters(self.net), "flops": operations(self.net, self.size),
-            "layout": "channels-last" if self.channels_last else "contiguous",
-        }  # fmt: skip
+        """Return what the table and its notes state of the network."""
+        count, flops = parameters(self.net, trainable_only=False), image_flops(self.net, self.size)
+        layout = "channels-last" if self.channels_last else "contiguous"
+        about = f"random weights, eager, {layout}; {count:,} parameters, {flops / 1e9:.2f} GFLOP per image"
+        return {"parameters": count, "flops": flops, "about": about}
 
     def _choose_layout(self, image: Any) -> None:
         times = {}

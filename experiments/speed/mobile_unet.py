@@ -1,4 +1,4 @@
-"""A network of MobileNet's class to compare with: separable convolutions all the way, after FastDepth (Wofk 2019)."""
+"""A network of MobileNet's class: separable convolutions throughout, after FastDepth (Wofk et al. 2019)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,167 @@
+"""The results of hudepth-bench: a table on standard output, bench.json, bench.csv, bench.md and bench.png."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from hudepth import __version__
+from hudepth.base.files import write_json, write_text
+from hudepth.base.machine import hardware
+from hudepth.base.tables import Table, stdout
+from hudepth.bench.plan import SETTINGS, Plan
+from hudepth.bench.plot import save_bench
+from hudepth.bench.rounds import Session
+from hudepth.bench.rows import Entry, Row, describe_efficiency, make_rows
+from hudepth.bench.subject import Subject
+
+LEGEND = (
+    "ms/image and images/s are those of the median pass; p50, p25-p75 and p95 are quantiles of a pass [ms]; x eager is "
+    "images/s relative to this model in eager mode, the median over rounds in which both ran; MB is the peak memory of "
+    "the process, libraries included; GFLOP/s and % peak count the operations of the network as trained (nominal), "
+    "% peak relative to the best single-precision matrix product of the same run: a yardstick and not a bound, since "
+    "operations that merging saves are counted; diff is the largest difference from eager at any pixel."
+)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A finished run."""
+
+    plan: Plan
+    subject: Subject
+    entries: list[Entry]
+    session: Session
+    rates: list[float]
+    """Of matrix products [GFLOP/s], one per round."""
+
+    @property
+    def peak_gflop_per_s(self) -> float | None:
+        """The best rate; None if it was not measured."""
+        return max(self.rates, default=None)
+
+    @property
+    def notes(self) -> list[str]:
+        """What was left out, and why."""
+        return [f"{name}: {line}" for name, lines in self.session.notes.items() for line in lines]
+
+    def rows(self) -> list[Row]:
+        """Return the rows of the table."""
+        return make_rows(
+            self.session.samples, self.entries,
+            peak_gflop_per_s=self.peak_gflop_per_s, max_depth_m=self.subject.max_depth_m,
+        )  # fmt: skip
+
+
+def write_report(measured: Measured, *, sentences: Sequence[str] = ()) -> None:
+    """Write all files, print table and notes.
+
+    Args:
+        measured: with at least one sample.
+        sentences: further results.
+
+    Raises:
+        OSError: if the output folder is full or gone.
+    """
+    plan, subject, rows = measured.plan, measured.subject, measured.rows()
+    best = describe_efficiency(rows, peak_gflop_per_s=measured.peak_gflop_per_s, merged_flops=subject.merged_flops)
+    lines = [*([best] if best else []), *sentences]
+    notes = [*_about(measured), *measured.notes]
+    machine = hardware() | ({"gpu": torch.cuda.get_device_name()} if plan.device == "cuda" else {})
+    height, width = subject.size
+    table = bench_table(rows, f"{subject.name}, {height} x {width}, threads: {plan.threads}")
+    content = {**_content(measured), "machine": machine, "sentences": lines, "notes": notes}
+    write_json(plan.output / "bench.json", {**content, "rows": [asdict(row) for row in rows]})
+    write_text(plan.output / "bench.csv", to_csv(rows))
+    write_text(plan.output / "bench.md", to_page(table, machine=machine, lines=[*lines, *notes]))
+    save_bench(plan.output / "bench.png", rows, title=f"{table.title}, on {machine['processor']}")
+    table.show()
+    for line in (LEGEND, *lines, *notes):
+        stdout().print(line, markup=False, highlight=False)
+    print(f"{plan.output / 'bench.md'} has the table, bench.csv its figures, bench.json every time, bench.png a plot.")
+
+
+def bench_table(rows: Sequence[Row], title: str) -> Table:
+    """Return the rows as they are shown."""
+    columns = (
+        "batch", "contender", "ms/image", "images/s", "x eager", "p50 [ms]", "p25-p75", "p95", "MB", "GFLOP/s",
+        "% peak", "diff [mm]",
+    )  # fmt: skip
+    table = Table(columns, title=title, left=2)
+    for row in rows:
+        table.add(
+            str(row.batch), row.contender, format_figure(row.ms_per_image), format_figure(row.images_per_s),
+            "" if row.times_eager is None else f"{row.times_eager:.2f}", format_figure(row.p50_ms),
+            f"{format_figure(row.p25_ms)}-{format_figure(row.p75_ms)}", format_figure(row.p95_ms),
+            f"{row.peak_mb:.0f}", "" if row.gflop_per_s is None else format_figure(row.gflop_per_s),
+            "" if row.share_of_peak is None else f"{100 * row.share_of_peak:.0f}",
+            "" if row.difference_mm is None else f"{row.difference_mm:.2g}",
+        )  # fmt: skip
+    return table
+
+
+def to_csv(rows: Sequence[Row]) -> str:
+    """Return all columns; what is not known is empty."""
+    cells = [["" if value is None else str(value) for value in asdict(row).values()] for row in rows]
+    return Table(list(Row.__dataclass_fields__), [*cells]).to_csv()
+
+
+def to_page(table: Table, *, machine: Mapping[str, Any], lines: Sequence[str]) -> str:
+    """Return a Markdown page: the machine, the table, the legend, and results and notes as a list."""
+    listed = "\n".join(f"- {line}" for line in lines)
+    return f"# {table.title}\n\nOn {describe_machine(machine)}.\n\n{table.to_markdown()}\n{LEGEND}\n\n{listed}\n"
+
+
+def describe_machine(machine: Mapping[str, Any]) -> str:
+    """Return where something was measured, in one line."""
+    versions = ", ".join(f"{name} {version}" for name, version in machine["packages"].items() if version)
+    memory = f"{machine['memory_gb']:.0f} GB, " if machine["memory_gb"] else ""
+    sets = " ".join(machine["instruction_sets"]) or "instruction sets unknown"
+    return (
+        f"{machine['processor']}, {machine['cores']} cores of which {machine['usable_cores']} may be used, {memory}"
+        f"{sets}; {machine['system']}, Python {machine['python']}, {versions}"
+    )
+
+
+def format_figure(value: float) -> str:
+    """Write a positive number with three digits, or all its whole ones."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+
+
+def _content(measured: Measured) -> dict[str, Any]:
+    """Return what only bench.json holds."""
+    subject, settings = asdict(measured.subject), asdict(measured.plan)
+    return {
+        "hudepth": __version__,
+        "model": {
+            **{key: value for key, value in subject.items() if key not in ("state", "trust")},
+            "trained": measured.plan.checkpoint is not None,
+        },
+        "settings": {key: settings[key] for key in SETTINGS},
+        "matmul_gflop_per_s": {"best": measured.peak_gflop_per_s, "of_each_round": measured.rates},
+        "times_s": [
+            {"contender": sample.name, "batch": sample.batch, "rounds": sample.rounds}
+            for sample in measured.session.samples
+        ],
+    }
+
+
+def _about(measured: Measured) -> list[str]:
+    """Say what was measured."""
+    subject = measured.subject
+    lines = [
+        f"{subject.parameters:,} parameters; an image takes {subject.flops / 1e9:.2f} GFLOP in the network as trained "
+        f"(nominal), {subject.merged_flops / 1e9:.2f} when it is merged.",
+        "Network alone: normalised float images in, unit depth out; decoding and resizing are not included.",
+    ]
+    if measured.plan.checkpoint is None:
+        lines.append("Random weights: they do not change the speed; the depth means nothing.")
+    if measured.plan.device == "cuda":
+        lines.append(
+            "Contenders in PyTorch ran on the GPU, where MB is the peak memory of their tensors; all others ran on the "
+            "CPU. PyTorch uses TF32 for convolutions, but not for matrix products, on GPUs that have it."
+        )
+    return lines + [f"{entry.name}: {entry.about}." for entry in measured.entries]
