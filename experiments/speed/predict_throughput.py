@@ -22,12 +22,12 @@ import torch
 from hudepth.base.console import setup_logging
 from hudepth.base.machine import usable_cores
 from hudepth.inference.backends import TorchBackend
+from hudepth.inference.depth_files import Style, write_depth
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.info import ModelInfo
 from hudepth.inference.inputs import find_inputs
 from hudepth.inference.model import DepthModel
+from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.stream import Stream, Tally
-from hudepth.inference.writing import Style, write_depth
 from hudepth.models import HybridUNet
 from hudepth.models.inference import inference_form
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from hudepth.base.errors import ConfigError
 
 _NYU_FX, _NYU_FY, _NYU_CX, _NYU_CY = 518.857901, 519.469611, 325.582449, 253.736166
 _NYU_WIDTH, _NYU_HEIGHT = 640, 480
+
+CameraOption = Annotated[tuple[float, float, float, float], "[fx,fy,cx,cy] in pixels of the images"]
+"""A camera as an option: the arguments of :class:`Intrinsics`."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         if not (0 < self.fx < np.inf and 0 < self.fy < np.inf and np.isfinite(self.cx) and np.isfinite(self.cy)):
             raise ConfigError(
-                f"intrinsics: [{self.fx},{self.fy},{self.cx},{self.cy}] is no camera. "
+                f"intrinsics: [{self.fx},{self.fy},{self.cx},{self.cy}] is not a camera. "
                 "Pass intrinsics=[fx,fy,cx,cy] in pixels of the image."
             )
 
@@ -40,22 +43,10 @@ class Intrinsics:
         Each axis is scaled by itself, as when an NYU frame is resized to ``height`` x ``width``: the field of view
         stays the same, whatever the aspect ratio.
         """
-        sx, sy = width / _NYU_WIDTH, height / _NYU_HEIGHT
-        return cls(_NYU_FX * sx, _NYU_FY * sy, (_NYU_CX + 0.5) * sx - 0.5, (_NYU_CY + 0.5) * sy - 0.5, known=False)
+        nyu = cls(_NYU_FX, _NYU_FY, _NYU_CX, _NYU_CY, known=False)
+        return nyu.scale(width / _NYU_WIDTH, height / _NYU_HEIGHT)
 
-
-def intrinsics(value: Any) -> Intrinsics | None:
-    """Return the camera that a configuration states, if it does.
-
-    Args:
-        value: ``[fx, fy, cx, cy]`` or None.
-
-    Raises:
-        ConfigError: if it is neither.
-    """
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 4 or not all(isinstance(entry, int | float) for entry in value):
-        raise ConfigError(f"intrinsics: {value} is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the images.")
-    fx, fy, cx, cy = (float(entry) for entry in value)
-    return Intrinsics(fx, fy, cx, cy)
+    def scale(self, x: float, y: float) -> Intrinsics:
+        """Return the camera of the same picture at ``x`` times the width and ``y`` times the height."""
+        cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return Intrinsics(self.fx * x, self.fy * y, cx, cy, known=self.known)

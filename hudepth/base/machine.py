@@ -6,9 +6,15 @@ import ctypes
 import math
 import os
 import platform
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from hudepth.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Where Linux says how much processor time a container gets: quota and period, or ``max``."""
@@ -34,6 +40,21 @@ def usable_cores() -> int:
         return max(1, min(allowed, math.ceil(int(quota) / int(period))))
     except (OSError, ValueError):  # another system, or no limit
         return allowed
+
+
+def torch_device(name: str, *, among: Sequence[str] = ("cuda", "mps", "cpu")) -> torch.device:
+    """Return the device of a name; ``auto`` means the first of ``among`` that this machine has.
+
+    Raises:
+        ConfigError: if this machine has no such device.
+    """
+    import torch
+
+    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    here = [kind for kind in among if available[kind]]
+    if name != "auto" and name not in here:
+        raise ConfigError(f"device: no '{name}' here. Pass device={' or '.join(reversed(here))}.")
+    return torch.device(here[0] if name == "auto" else name)
 
 
 def hardware() -> dict[str, Any]:

@@ -77,7 +77,7 @@ def export(spec: Spec) -> GraphRunner:
     """
     from hudepth.bench.torch_runners import build_merged
     from hudepth.export.graphs import export_onnx
-    from hudepth.inference.info import ModelInfo
+    from hudepth.inference.model_info import ModelInfo
     from hudepth.models.cost import parameters
 
     net, options = build_merged(spec), spec.options

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
-
 from hudepth.base.errors import ConfigError
-from hudepth.base.machine import usable_cores
+from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Choice, Range, Size, output_folder, parse
 from hudepth.bench.backends import BACKENDS, REFERENCE
 
@@ -46,10 +44,7 @@ class Plan:
             )
         if not self.batches:
             raise ConfigError("batches: the list is empty. Pass batches=[1,4].")
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError("device: no GPU that CUDA can use here. Pass device=cpu.")
-        if self.device == "auto":
-            self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = torch_device(self.device, among=("cuda", "cpu")).type
         self.backends = [name for name in BACKENDS if name == REFERENCE or name in self.backends]
         self.batches, self.threads = sorted(set(self.batches)), self.threads or usable_cores()
 

@@ -73,14 +73,15 @@ def _load(
     checkpoint: str, runs: str, *, trust: list[str], size: tuple[int, int] | None
 ) -> tuple[nn.Module, dict[str, Any], tuple[int, int], float]:
     """Return network, configuration, size and maximum depth [m]."""
-    from hudepth.inference.backends import EXPORTED, info_of
+    from hudepth.inference.backends import EXPORTED
+    from hudepth.inference.model_info import ModelInfo
     from hudepth.runs.checkpoint import load_checkpoint  # slow to import, and random weights do not need it
 
     if Path(checkpoint).suffix.lower() in EXPORTED:
         raise ConfigError("checkpoint: exported files are not accepted. Pass the checkpoint or bundle they came from.")
     loaded = load_checkpoint(checkpoint, runs=runs)
     net = loaded.build_net(trust=trust)
-    info = info_of(loaded, parameters=parameters(net, trainable_only=False), size=size)
+    info = ModelInfo.of_checkpoint(loaded, parameters=parameters(net, trainable_only=False), size=size)
     return net, loaded.config["model"], info.size, info.max_depth_m
 
 

@@ -1,1 +1,1 @@
-"""A page in the browser that shows what a model sees."""
+"""A web page that shows the depth a model predicts."""

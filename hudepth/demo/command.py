@@ -1,31 +1,41 @@
-"""hudepth-demo: a page on this machine that shows the depth of a picture."""
+"""hudepth-demo: a local web page that shows the depth of a picture."""
 
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from omegaconf import DictConfig
 
-from hudepth.base.camera import intrinsics
+from hudepth.base.camera import CameraOption, Intrinsics
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.options import plain, whole_number
+from hudepth.base.images import MAX_PIXELS
+from hudepth.base.options import Range, parse, plain
 from hudepth.demo.answers import Limits, answer
 from hudepth.demo.server import free_port, serve
-from hudepth.inference.model import DepthModel
-from hudepth.inference.options import load_model
+from hudepth.inference.model import DepthModel, ModelOptions, load_model
 
-MEGABYTE = 2**20
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(ModelOptions):
+    """Options of hudepth-demo; conf/demo.yaml explains them."""
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Range(0, 65535)] = 7860
+    max_upload_mb: Annotated[float, Range(0, 1024, above=True)] = 20
+    max_pixels: Annotated[int, Range(1, MAX_PIXELS)] = 40_000_000
+    intrinsics: CameraOption | None = None
 
 
 def demo(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C.
 
     Args:
-        cfg: what conf/demo.yaml and the command line compose to.
+        cfg: the configuration; see :class:`DemoOptions`.
 
     Raises:
         HudepthError: with one line for the user.
@@ -33,46 +43,26 @@ def demo(cfg: DictConfig) -> None:
     config = plain(cfg)
     if importlib.util.find_spec("gradio") is None:
         raise ConfigError("gradio is not installed. Run pip install 'hudepth[demo]'.")
-    limits, camera = _limits(config), intrinsics(config["intrinsics"])
-    host, port = str(config["host"]), _port(config)
-    free_port(host, port)  # before the seconds that loading takes
-    model = _load(config)
+    options = parse(DemoOptions, {**config, "runs": config["paths"]["runs"]})
+    camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
+    limits = Limits(upload_bytes=int(options.max_upload_mb * 2**20), pixels=options.max_pixels)
+    free_port(options.host, options.port)  # before the seconds that loading takes
+    model = load_model(options)
+    model.predict(np.zeros((*model.info.size, 3), np.uint8))  # the first run is slow; visitors should not wait for it
 
     def ready(address: str) -> None:
-        log.info("model: %s; open %s (Ctrl-C ends)", describe(model), address)
+        log.info("model: %s; open %s (Ctrl-C stops)", describe(model), address)
 
     serve(
         partial(answer, model=model, limits=limits, intrinsics=camera),
-        host=host, port=port, limits=limits, info=model.info, ready=ready,
-        camera="as given" if camera else "NYU Depth V2's, since intrinsics= was not given",
+        host=options.host, port=options.port, limits=limits, info=model.info, ready=ready,
+        camera="as given" if camera else "NYU Depth V2's, since intrinsics= is not set",
     )  # fmt: skip
 
 
 def describe(model: DepthModel) -> str:
-    """Say what a model is, in a few words."""
+    """Return a short description of a model."""
     info = model.info
     source = info.trained_on.get("source", "unknown data")
     size = f"{info.size[0]} x {info.size[1]}"
     return f"{info.name}, trained on {source}, {size}, up to {info.max_depth_m:g} m, in {model.backend.name}"
-
-
-def _load(config: dict[str, Any]) -> DepthModel:
-    """Load the model and run it once, so that the first visitor does not wait for what is set up on first use."""
-    model = load_model(config)
-    model.predict(np.zeros((*model.info.size, 3), np.uint8))
-    return model
-
-
-def _port(config: dict[str, Any]) -> int:
-    port = whole_number(config, "port", default=7860)
-    if port > 65535:
-        raise ConfigError(f"port: {port} is above 65535. Leave it out for 7860, or pass 0 for any that is free.")
-    return port
-
-
-def _limits(config: dict[str, Any]) -> Limits:
-    megabytes = config["max_upload_mb"]
-    if isinstance(megabytes, bool) or not isinstance(megabytes, int | float) or not 0 < megabytes <= 1024:
-        raise ConfigError(f"max_upload_mb: {megabytes} is not above 0 and at most 1024. Leave it out for 20.")
-    pixels = whole_number(config, "max_pixels", default=40_000_000, least=1)
-    return Limits(upload_bytes=int(megabytes * MEGABYTE), pixels=pixels)

@@ -1,4 +1,4 @@
-"""The page: gradio's picture, examples and downloads around a viewer of our own."""
+"""The page: gradio's picture, examples and downloads around our own viewer."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import gradio as gr
-from gradio.data_classes import ImageData
 
 from hudepth.base.console import log
 from hudepth.base.errors import HudepthError
 from hudepth.demo.answers import Answer, colour_table
-from hudepth.demo.files import Files
-from hudepth.inference.info import ModelInfo
+from hudepth.demo.session_files import Files
+from hudepth.inference.model_info import ModelInfo
 
 FONTS = ["ui-sans-serif", "system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "Arial", "sans-serif"]
 MONO = ["ui-monospace", "Menlo", "Consolas", "monospace"]
-"""Fonts that machines have; gradio's own themes would load others from elsewhere."""
+"""Common system fonts; gradio's own themes would load others from the web."""
 BUTTONS = ("PNG16 (mm)", "npy (m)", "PLY (m)")
 KEEP_S = (600, 3600)
-"""How often files are looked through that no session claimed, and how old they may become [s]."""
+"""How often gradio deletes files that no session owns, and their maximum age [s]."""
 
 
 def build(
@@ -32,13 +31,13 @@ def build(
     """Lay out the page.
 
     Args:
-        compute: from an uploaded file to its depth; raises HudepthError with a line for the page.
+        compute: predicts an uploaded file; raises HudepthError with one line for the page.
         files: where results go.
         examples: pictures to offer.
         info: of the model.
-        camera: in words, whose intrinsics the point cloud has.
+        camera: whose intrinsics the point cloud uses, in words.
     """
-    gr.set_static_paths([files.examples, files.results])  # served where they lie, not copied
+    gr.set_static_paths([files.examples, files.results])  # served in place, not copied
     blocks: gr.Blocks = gr.Blocks(title="hudepth", analytics_enabled=False, delete_cache=KEEP_S, fill_width=True)
     with blocks:
         gr.HTML(headline(info, camera), elem_id="headline")
@@ -49,31 +48,33 @@ def build(
                     buttons=["fullscreen"], alt_text="The picture you chose", elem_id="picture",
                     webcam_options=gr.WebcamOptions(mirror=False, constraints={"video": {"facingMode": "environment"}}),
                 )  # fmt: skip
-                gr.Examples([[str(path)] for path in examples], [image], label="Examples: drawn rooms", elem_id="rooms")
+                gr.Examples(
+                    [[str(path)] for path in examples], [image], label="Examples: rendered rooms", elem_id="rooms"
+                )
             with gr.Column(scale=5, min_width=320):
                 viewer = _viewer()
                 with gr.Row(elem_id="downloads"):
                     buttons = [
                         gr.DownloadButton(label, interactive=False, size="md", min_width=80) for label in BUTTONS
                     ]
-        vars(image)["preprocess"] = path_of  # gradio's own opens the file, with every decoder that Pillow has
+        # gradio's own would open the file, with every decoder that Pillow has
+        vars(image)["preprocess"] = lambda payload: payload and payload.path
         image.change(
             handler(compute, files), [image], [viewer, *buttons],
             show_progress="minimal", trigger_mode="always_last", api_visibility="private",
         )  # fmt: skip
-        blocks.unload(_forget(files))
+
+        def forget(request: gr.Request) -> None:
+            files.end(request.session_hash or "")
+
+        blocks.unload(forget)
     return blocks
 
 
-def path_of(payload: ImageData | None) -> str | None:
-    """Return the path of an uploaded file, which is left alone."""
-    return None if payload is None else payload.path
-
-
 def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., Iterator[tuple[Any, ...]]]:
-    """Return what is called with each new picture: yields the viewer's value and the three buttons.
+    """Return the function for each new picture, which yields the viewer's value and the three buttons.
 
-    The depth is shown before the files are written, which takes longer for large pictures.
+    The depth is shown before the files are written, which takes a while for large pictures.
     """
     off = tuple(gr.update(value=None, interactive=False) for _ in BUTTONS)
 
@@ -103,13 +104,6 @@ def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., It
     return show
 
 
-def _forget(files: Files) -> Callable[[gr.Request], None]:
-    def forget(request: gr.Request) -> None:
-        files.end(request.session_hash or "")
-
-    return forget
-
-
 def _viewer() -> gr.HTML:
     return gr.HTML(
         None,
@@ -122,18 +116,18 @@ def _viewer() -> gr.HTML:
 
 
 def headline(info: ModelInfo, camera: str) -> str:
-    """Return what stands above all: which model this is, and what its numbers are worth."""
+    """Return the headline: which model this is, and how far to trust its numbers."""
     source = escape(str(info.trained_on.get("source") or "unknown data"))
     return (
         '<div class="hd-head"><h1>Depth from one picture</h1><p>'
-        f"{escape(info.name)} of {info.parameters / 1e6:.2f} million parameters, trained on {source} for {info.epoch} "
-        f"epochs, tells 0 to {info.max_depth_m:g} m. Camera of the point cloud: {escape(camera)}. "
-        "Do not trust the metres of pictures unlike those it was trained on.</p></div>"
+        f"{escape(info.name)}, {info.parameters / 1e6:.2f} million parameters, trained on {source} for {info.epoch} "
+        f"epochs, predicts 0 to {info.max_depth_m:g} m. Camera of the point cloud: {escape(camera)}. "
+        "Do not trust the metres in pictures unlike the training data.</p></div>"
     )
 
 
 def theme() -> gr.Theme:
-    """Return gradio's default look with fonts of the machine itself."""
+    """Return gradio's default theme with system fonts."""
     return gr.themes.Default(primary_hue="blue", font=FONTS, font_mono=MONO)
 
 

@@ -1,4 +1,4 @@
-// A coloured point cloud in WebGL that turns about its middle. Coordinates: x right, y down, z forward [m].
+// A coloured point cloud in WebGL that rotates about its centre. Coordinates: x right, y down, z forward [m].
 function pointsView(canvas) {
   const gl = canvas.getContext("webgl", { antialias: false });
   if (!gl) return null;
@@ -31,7 +31,7 @@ function pointsView(canvas) {
     return made;
   }
 
-  // Fills a buffer and says how the program reads it: three numbers a point.
+  // Fills a buffer and declares its layout: three numbers per point.
   function fill(name, values, type) {
     const where = gl.getAttribLocation(program, name);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
@@ -58,7 +58,7 @@ function pointsView(canvas) {
     }
     const sorted = Uint16Array.from(depth).sort();
     pivot = sorted[sorted.length >> 1] / 1000 || 2;
-    focal = (2 * fx) / width; // as wide as the camera saw
+    focal = (2 * fx) / width; // the field of view of the camera
     across = width;
     fill("point", points.subarray(0, 3 * count), gl.FLOAT);
     fill("colour", colours.subarray(0, 3 * count), gl.UNSIGNED_BYTE);

@@ -1,4 +1,4 @@
-"""Serves the page on this machine until Ctrl-C; nothing is sent to, or asked of, any other."""
+"""Serve the page on this machine until Ctrl-C; no other machine is contacted."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError
 from hudepth.demo.answers import Answer, Limits
-from hudepth.demo.files import Files, draw_examples
-from hudepth.inference.info import ModelInfo
+from hudepth.demo.session_files import Files, draw_examples
+from hudepth.inference.model_info import ModelInfo
 
 SILENCE = {
     "GRADIO_ANALYTICS_ENABLED": "False",
@@ -28,22 +28,22 @@ SILENCE = {
     "DO_NOT_TRACK": "1",
     "FASTAPI_OTEL_AUTO_CONFIGURE": "false",
 }
-"""What keeps gradio, and the libraries it brings, from calling home."""
+"""Settings that keep gradio and its dependencies from sending telemetry."""
 POLICY = (
     "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'; object-src 'none'; form-action 'self'; frame-ancestors 'none'"
 )
-"""What browsers load for this page: nothing from other hosts. gradio's own parts need inline scripts and eval."""
+"""Browsers load nothing from other hosts. gradio itself needs inline scripts and eval."""
 
 
 class Policy:
-    """ASGI middleware that adds :data:`POLICY` to each answer."""
+    """ASGI middleware that adds :data:`POLICY` to each response."""
 
     def __init__(self, app: Any) -> None:
         self._app = app
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Pass a request on."""
+        """Handle a request."""
 
         async def send_with_policy(message: Any) -> None:
             if message["type"] == "http.response.start":
@@ -58,12 +58,12 @@ def free_port(host: str, port: int) -> int:
     """Return ``port``, or a free one for 0.
 
     Raises:
-        ConfigError: if it is taken, or the host is none of this machine's addresses.
+        ConfigError: if it is taken, or the host is not an address of this machine.
     """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         with socket.socket(family, socket.SOCK_STREAM) as trial:
-            if os.name == "posix":  # elsewhere it would let two programs share a port
+            if os.name == "posix":  # on Windows it would let two programs share a port
                 trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind((host, port))
             return int(trial.getsockname()[1])
@@ -71,7 +71,7 @@ def free_port(host: str, port: int) -> int:
         raise ConfigError(f"host: no address '{host}'. Pass host=127.0.0.1, or 0.0.0.0 for all networks.") from None
     except OSError as error:
         raise ConfigError(
-            f"port: {host}:{port} cannot be had ({error.strerror}). Pass another port=, or port=0 for any that is free."
+            f"port: {host}:{port} is not available ({error.strerror}). Pass another port=, or port=0 for any free one."
         ) from None
 
 
@@ -88,19 +88,19 @@ def serve(
     """Serve the page until the process is interrupted or terminated.
 
     Args:
-        compute: from an uploaded file to its depth.
+        compute: predicts an uploaded file.
         host: address to listen on.
         port: to listen on; 0 takes a free one.
-        limits: what is refused.
+        limits: the largest picture that is accepted.
         info: of the model, for the page.
-        camera: whose intrinsics the point cloud has, for the page.
-        ready: called with the page's address once it answers.
+        camera: whose intrinsics the point cloud uses, for the page.
+        ready: called with the page's address once it responds.
 
     Raises:
         ConfigError: if the port is taken.
     """
     port = free_port(host, port)
-    atexit.register(gc.freeze)  # or the interpreter looks for garbage in all of gradio once more: two seconds
+    atexit.register(gc.freeze)  # skips a last garbage collection of all of gradio: two seconds
     with Files() as files, _ended_by_signals() as ended:
         _silence(files.uploads)
         from starlette.middleware import Middleware
@@ -123,7 +123,7 @@ def serve(
 
 
 def _close(blocks: Any) -> None:
-    """End the server at once: it would wait for open pages, and it complains of being cut short."""
+    """Stop the server at once: it would wait for open pages, and log an error when interrupted."""
     logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
     if blocks.server is not None:
         blocks.server.force_exit = True
@@ -131,9 +131,9 @@ def _close(blocks: Any) -> None:
 
 
 def _silence(uploads: Path) -> None:
-    """Set what gradio reads when it is imported: where uploads go, and that it tells nobody of them."""
+    """Set what gradio reads on import: the folder of uploads, and no telemetry."""
     os.environ.update(SILENCE, GRADIO_TEMP_DIR=str(uploads))
-    for name in ("NO_PROXY", "no_proxy"):  # gradio asks its own page once, which no proxy could reach
+    for name in ("NO_PROXY", "no_proxy"):  # gradio requests its own page once, which no proxy can reach
         os.environ[name] = ",".join(filter(None, [os.environ.get(name), "127.0.0.1", "localhost"]))
     if (runtime := sys.modules.get("onnxruntime")) is not None and hasattr(runtime, "disable_telemetry_events"):
         runtime.disable_telemetry_events()
@@ -141,7 +141,7 @@ def _silence(uploads: Path) -> None:
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and a termination set, so that what was begun is ended in order."""
+    """Yield an event that SIGINT and SIGTERM set, for an orderly shutdown."""
     ended = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield ended

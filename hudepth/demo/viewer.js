@@ -2,7 +2,7 @@
 const find = (selector) => element.querySelector(selector);
 const stage = find(".hd-stage"), cloud = find(".hd-cloud"), photo = find(".hd-photo"), slider = find(".hd-slider input");
 const reading = find(".hd-reading"), dot = find(".hd-dot"), own = find(".hd-own input");
-const HEIGHT_VH = 58; // of the picture, at most, in hundredths of the window's
+const HEIGHT_VH = 58; // maximum height of the picture, in percent of the window
 const bytesOf = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 const colours = bytesOf(props.colours); // 256 x RGB, near first
 let shown = null, mode = "map", points, at = null;
@@ -17,7 +17,7 @@ function show(value) {
   hideReading();
   if (result) showResult(result);
   if (value && element.getBoundingClientRect().top > 0.5 * window.innerHeight) {
-    element.scrollIntoView({ block: "start" }); // on a phone it lies below the examples
+    element.scrollIntoView({ block: "start" }); // on a phone it is below the examples
   }
 }
 
@@ -74,7 +74,7 @@ function split() {
   find(".hd-line").style.left = `${share}%`;
 }
 
-// x and y: shares of the width and height, from 0 to 1.
+// x and y: fractions of the width and height, from 0 to 1.
 function read(x, y) {
   if (!shown) return;
   const inside = (value) => Math.max(0, Math.min(0.999999, value));
@@ -110,7 +110,7 @@ function setMode(next) {
 async function showPoints() {
   points = points || pointsView(cloud) || { missing: true };
   if (points.missing) {
-    find(".hd-hint").textContent = "This browser has no WebGL, so the points cannot be shown here. The PLY file has them.";
+    find(".hd-hint").textContent = "This browser has no WebGL, so it cannot show the points. The PLY file contains them.";
     return;
   }
   if (points.stale === false) return points.draw();
@@ -159,13 +159,13 @@ own.addEventListener("change", () => shown && paint());
 for (const button of element.querySelectorAll(".hd-modes button")) {
   button.addEventListener("click", () => setMode(button.dataset.mode));
 }
-// gradio gives the examples no text of their own.
+// gradio gives the examples no alternative text.
 function nameExamples(tries) {
   const pictures = document.querySelectorAll("#rooms img");
   for (const each of pictures) each.alt = `Example: ${each.src.split("/").pop().split(".")[0].replace("_", " ")}`;
   if (!pictures.length && tries) setTimeout(() => nameExamples(tries - 1), 100);
 }
-// A picture pasted anywhere on the page goes where a chosen file would.
+// A picture pasted anywhere on the page is treated like a chosen file.
 document.addEventListener("paste", (event) => {
   const input = document.querySelector("#picture input[type=file]");
   const file = Array.from(event.clipboardData.files).find((each) => each.type.startsWith("image/"));

@@ -1,1 +1,1 @@
-"""From a checkpoint to files that other programs run: each is checked against the checkpoint before it is kept."""
+"""Export a checkpoint to files that other programs run; each is compared with the checkpoint before it is kept."""

@@ -1,4 +1,4 @@
-"""Write a bundle; :mod:`hudepth.runs.bundles` says what one is and reads it."""
+"""Write a bundle; :mod:`hudepth.runs.bundles` describes and reads them."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from hudepth import __version__
+from hudepth.inference.depth_files import jpeg
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.info import ModelInfo
-from hudepth.inference.writing import jpeg
+from hudepth.inference.model_info import ModelInfo
 from hudepth.runs.bundles import CARD, CONFIG, KIND, ONNX, WEIGHTS
 from hudepth.runs.checkpoint import VERSION, Checkpoint
 
 PLACES = ("root", "cache")
-"""Keys of ``data`` that say where things lie on the machine of the training, which is nobody else's business."""
+"""Keys of ``data`` that name paths on the machine of the training; they are not published."""
 PARTS = ("name", "seed", "model", "data", "loss", "optim", "schedule")
-"""What of a run's configuration goes along."""
+"""Parts of a run's configuration that the bundle contains."""
 
 
 def write_bundle(
@@ -33,16 +33,16 @@ def write_bundle(
     results: Mapping[str, Mapping[str, Any]],
     samples: Sequence[DepthMap],
 ) -> None:
-    """Write everything into an empty folder.
+    """Write a bundle into a new folder.
 
     Args:
-        folder: is made.
-        checkpoint: whose tensors and record go along.
-        info: the same in short.
-        onnx: file to copy; None: the bundle has none.
+        folder: is created.
+        checkpoint: tensors and record of the training.
+        info: its description.
+        onnx: file to copy, if the bundle has one.
         card: the model card.
         results: contents of ``metrics.json`` by protocol.
-        samples: pictures to show.
+        samples: predictions to show.
     """
     from safetensors.torch import save
 
@@ -54,11 +54,11 @@ def write_bundle(
         config["model"] = {**config["model"], "weights": None}  # the encoder's initial weights, which may be a path
     if isinstance(config.get("data"), dict):
         config["data"] = {key: None if key in PLACES else value for key, value in config["data"].items()}
-    stated = {
+    record = {
         "kind": KIND, "version": VERSION, "hudepth": __version__, "epoch": checkpoint.epoch,
         "config": config, "split": checkpoint.split, "data": checkpoint.data,
     }  # fmt: skip
-    (folder / CONFIG).write_text(json.dumps(stated, indent=2) + "\n", encoding="utf-8")
+    (folder / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     if onnx is not None:
         shutil.copyfile(onnx, folder / ONNX)
     (folder / CARD).write_text(card, encoding="utf-8")
@@ -70,17 +70,17 @@ def write_bundle(
         (folder / "samples" / f"{number}.jpg").write_bytes(jpeg(sample.side_by_side()))
 
 
-def halved(checkpoint: Checkpoint) -> Checkpoint:
-    """Return a checkpoint whose kernels and matrices are 16-bit floats: half the size, for about three digits.
+def halve(checkpoint: Checkpoint) -> Checkpoint:
+    """Return a checkpoint whose kernels and matrices are 16-bit floats: half the size, about three digits.
 
-    Norms and biases stay as they are: they are few, and variances may lie outside of what 16 bits hold.
+    Norms and biases keep 32 bits: they are few, and variances may exceed the range of 16.
     """
     state = {name: tensor.half() if tensor.ndim > 1 else tensor for name, tensor in checkpoint.state.items()}
     return replace(checkpoint, state=state)
 
 
 def zip_folder(folder: Path, path: Path) -> None:
-    """Put a folder into a zip, under its own name; weights do not compress, so nothing is."""
+    """Put a folder into a zip, under its own name, uncompressed, since weights do not compress."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for file in sorted(folder.rglob("*")):
             if file.is_file():

@@ -1,4 +1,4 @@
-"""The model card: what a stranger must know before using a model."""
+"""The model card: what users must know before they use a model."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from hudepth import __version__
-from hudepth.inference.info import ModelInfo
+from hudepth.base.tables import Table
+from hudepth.inference.model_info import ModelInfo
+from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.runs.checkpoint import Checkpoint
 
-SHOWN = ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")
-UNITS = {"rmse": " [m]"}
 NYU = (
     "NYU Depth V2 (Silberman, Hoiem, Kohli, Fergus: Indoor Segmentation and Support Inference from RGBD Images, "
     "ECCV 2012); its authors publish it for research and state no licence for other uses."
@@ -37,18 +37,19 @@ CITATION = """@article{turkmen2025hybrid,
 
 def model_card(
     checkpoint: Checkpoint, info: ModelInfo, *, name: str, results: Mapping[str, Mapping[str, Any]], parity: str,
-    samples: str, half: bool = False,
+    samples: int = 0, origin: str = "", half: bool = False,
 ) -> str:  # fmt: skip
     """Write the card of a model.
 
     Args:
-        checkpoint: says how it was trained.
-        info: says what it takes and gives.
+        checkpoint: records how it was trained.
+        info: its inputs and outputs.
         name: of the model.
         results: contents of ``metrics.json`` by protocol; may be empty.
-        parity: how far its ONNX file is from it, or its 16-bit weights are.
-        samples: what its pictures show.
-        half: kernels and matrices are kept as 16-bit floats, and there is no ONNX file.
+        parity: the difference between the checkpoint and the ONNX file or 16-bit weights, in words.
+        samples: number of sample pictures.
+        origin: of the samples, for example ``test images of nyu_labeled``.
+        half: kernels and matrices are stored as 16-bit floats, and there is no ONNX file.
 
     Returns:
         Markdown with the header that model hubs read.
@@ -56,10 +57,10 @@ def model_card(
     source = str(checkpoint.data.get("source", "unknown"))
     sections = (
         _header(source, onnx=not half), f"# {name}", _about(info), _use(info, parity, half=half),
-        _training(checkpoint, source), _results(results), samples, _limits(info, source),
+        _training(checkpoint, source), _results(results), _samples(samples, origin), _limits(info, source),
         "## Licence\n\nCode: MIT. Training data: "
-        + DATA_LICENCES.get(source, f"'{source}', whose terms whoever publishes this model must state here.")
-        + " What that means for the weights is for you to judge.",
+        + DATA_LICENCES.get(source, f"'{source}', whose terms the publisher of this model must state here.")
+        + " What this means for the weights is for you to judge.",
         f"## How to cite\n\nhudepth {__version__}, and the paper it implements:\n\n```bibtex\n{CITATION}\n```",
     )  # fmt: skip
     return "\n\n".join(section for section in sections if section) + "\n"
@@ -84,15 +85,15 @@ def _use(info: ModelInfo, parity: str, *, half: bool) -> str:
     height, width = info.size
     if half:
         files = (
-            "`model.safetensors` holds kernels and matrices as 16-bit floats and is computed with in 32; against the "
-            f"weights of the training it is {parity}. `config.json` says how to build the network around them."
+            "`model.safetensors` holds kernels and matrices as 16-bit floats; computation uses 32 bits. Compared with "
+            f"the trained weights, it is {parity}. `config.json` describes the network."
         )
     else:
         files = (
             f"`model.onnx` needs no hudepth: input `image` uint8 [batch, {height}, {width}, 3], RGB, the whole image "
             f"resized to this size (averaged over areas); output `depth_m` float32 [batch, {height}, {width}] in "
             f"metres. It is {parity}.\n"
-            "`model.safetensors` holds float32 tensors, `config.json` how to build the network around them."
+            "`model.safetensors` holds float32 tensors, `config.json` describes the network."
         )
     return (
         "## Use\n\n```bash\nhudepth-predict checkpoint=<this folder or its zip> input=photos\n```\n\n"
@@ -118,7 +119,7 @@ def _training(checkpoint: Checkpoint, source: str) -> str:
 
 
 def _loss(loss: Mapping[str, Any]) -> str:
-    """Name a loss, or those that it mixes."""
+    """Return the name of a loss, or the parts of a mixture."""
     names = [f"{weight:g} {_class(loss['losses'][part])}" for part, weight in loss.get("weights", {}).items() if weight]
     return " + ".join(names) or _class(loss)
 
@@ -129,35 +130,42 @@ def _class(config: Mapping[str, Any]) -> str:
 
 def _results(results: Mapping[str, Mapping[str, Any]]) -> str:
     if not results:
-        return "## Results\n\nNone are on record. `hudepth-test` makes some; export the run afterwards."
-    lines = [
-        "## Results", "",
-        "On the test subset of that split; in brackets 95 % intervals by bootstrap over scenes. Crop, caps, mask and",
-        "averaging of each protocol are in `metrics/`.", "",
-        "| protocol | images | " + " | ".join(f"{key}{UNITS.get(key, '')}" for key in SHOWN) + " |",
-        "|---|---|" + "---|" * len(SHOWN),
-    ]  # fmt: skip
+        return "## Results\n\nNone are recorded. Run `hudepth-test`, then export the run again."
+    names = metric_names("narrow", among={key for result in results.values() for key in result["metrics"]["model"]})
+    table = Table(["protocol", "images", *(metric_info(name).label for name in names)], left=2)
     for protocol, result in results.items():
         values, ranges = result["metrics"]["model"], result.get("intervals", {}).get("model", {})
-        cells = [_cell(values.get(key), ranges.get(key)) for key in SHOWN]
-        lines.append(f"| {protocol} | {result['images']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        table.add(protocol, str(result["images"]), *(_cell(name, values.get(name), ranges.get(name)) for name in names))
+    return (
+        "## Results\n\n"
+        "On the test subset of that split; in brackets 95 % intervals by bootstrap over scenes. Crop, caps, mask and\n"
+        f"averaging of each protocol are in `metrics/`.\n\n{table.to_markdown().strip()}"
+    )
 
 
-def _cell(value: float | None, ends: Any) -> str:
+def _cell(name: str, value: float | None, ends: Any) -> str:
+    info = metric_info(name)
     if value is None:
         return "-"
-    if not ends or None in ends:
-        return f"{value:.3f}"
-    return f"{value:.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
+    return info.format(value) + (f" [{', '.join(map(info.format, ends))}]" if ends and None not in ends else "")
+
+
+def _samples(count: int, origin: str) -> str:
+    if not count:
+        return ""
+    pictures = "\n".join(f"![image and predicted depth](samples/{number}.jpg)" for number in range(count))
+    return (
+        f"## Samples\n\n{pictures}\n\nFrom the {origin}, not selected by hand. Left: the image at the network's size, "
+        "right: its depth."
+    )
 
 
 def _limits(info: ModelInfo, source: str) -> str:
     return (
         "## Limits\n\n"
-        f"- It knows scenes like those of `{source}`. Elsewhere (outdoors, other cameras, other heights) its metres "
-        "are guesses: a single image does not hold the scale.\n"
-        f"- Nothing lies beyond {info.max_depth_m:g} m for it.\n"
-        "- Images are squeezed to the input size as in training; other fields of view shift all distances.\n"
-        "- Mirrors, glass, thin things and edges are where it errs most. Do not steer or brake by it."
+        f"- Trained on scenes like those of `{source}`. Elsewhere (outdoors, other cameras, other heights) its metres "
+        "are guesses: a single image does not determine scale.\n"
+        f"- It predicts nothing beyond {info.max_depth_m:g} m.\n"
+        "- Images are resized to the input size as in training; a different field of view shifts all distances.\n"
+        "- Errors are largest at mirrors, glass, thin objects and edges. Do not steer or brake by it."
     )

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import torch
 from omegaconf import DictConfig
 from torch import nn
 
@@ -17,205 +19,223 @@ from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
 from hudepth.base.files import write_json
 from hudepth.base.machine import usable_cores
-from hudepth.base.options import output_folder, plain, several, size_option, whole_number
-from hudepth.export.accuracy import int8_accuracy
-from hudepth.export.bundle import halved, write_bundle, zip_folder
+from hudepth.base.options import Choice, Range, Size, output_folder, parse, plain
+from hudepth.export.bundle import halve, write_bundle, zip_folder
 from hudepth.export.card import model_card
+from hudepth.export.comparison_images import ComparisonImages, find_images
 from hudepth.export.graphs import export_onnx, export_openvino, export_program
-from hudepth.export.images import ExportImages, export_images
+from hudepth.export.int8_accuracy import measure_int8
 from hudepth.export.parity import Parity, check, compare
 from hudepth.export.quantise import check_calibration, quantise
-from hudepth.inference.backends import PT2, TorchBackend, info_of, open_exported
-from hudepth.inference.info import ModelInfo
+from hudepth.inference.backends import PT2, TorchBackend, open_exported
 from hudepth.inference.model import DepthModel
+from hudepth.inference.model_info import ModelInfo
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 
 FORMATS = ("onnx", "torch_export", "openvino", "int8", "bundle")
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of hudepth-export; conf/export.yaml explains them."""
+
+    checkpoint: str
+    runs: Path
+    cache: str
+    format: list[Annotated[str, Choice(FORMATS)]]
+    output: str
+    protocol: Mapping[str, Any]
+    processing: bool = True
+    size: Size | None = None
+    tolerance_mm: Annotated[float, Range(0, above=True)] = 1.0
+    images: str | None = None
+    compared: Annotated[int, Range(1)] = 50
+    calibration: Annotated[int, Range(1)] = 128
+    accuracy: bool = True
+    half: bool = False
+    zip: bool = False
+    name: str | None = None
+    data: Mapping[str, Any] = field(default_factory=dict)
+    trust: list[str] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class Work:
-    """What all formats need."""
+    """What all formats are made from."""
 
+    options: ExportOptions
     checkpoint: Checkpoint
     net: nn.Module
-    """In the form it shall run."""
+    """In the form in which it runs."""
     reference: TorchBackend
+    """The network as trained, with which exports are compared."""
     info: ModelInfo
-    images: ExportImages
-    config: dict[str, Any]
+    images: ComparisonImages
+    output: Path
     folder: Path
-    """Where files are made before they are known to be good."""
+    """Where files are made before they are checked."""
 
+    @cached_property
     def onnx(self) -> Path:
-        """Return the ONNX file with the processing inside, made on first use: other formats start from it."""
+        """The ONNX file with processing inside, from which other formats start."""
         path = self.folder / "processed.onnx"
-        if not path.exists():
-            export_onnx(self.net, path, info=replace(self.info, processing=True))
+        export_onnx(self.net, path, info=replace(self.info, processing=True))
         return path
+
+    @cached_property
+    def configured_onnx(self) -> Path:
+        """The ONNX file with or without processing, as configured."""
+        if self.info.processing:
+            return self.onnx
+        export_onnx(self.net, self.folder / "plain.onnx", info=self.info)
+        return self.folder / "plain.onnx"
+
+    def compare(self, path: Path, *, backend: str) -> Parity:
+        """Compare a file with the checkpoint; raises CheckpointError if it differs by more than the tolerance."""
+        opened = open_exported(path, backend=backend, threads=usable_cores(), trust=[PT2])
+        parity = compare(opened, self.reference, self.images.compared)
+        check(parity, what=path.name, tolerance_mm=self.options.tolerance_mm)
+        return parity
+
+    def keep(self, *paths: Path, parity: Parity) -> dict[str, Any]:
+        """Move checked files to the output folder; return their entry in export.json."""
+        for path in paths:
+            path.replace(self.output / path.name)
+        log.info("%s: %s", self.output / paths[0].name, parity)
+        return {
+            "files": [path.name for path in paths],
+            "compared": {"images": parity.images, "worst_mm": parity.worst_mm, "mean_mm": parity.mean_mm},
+        }
 
 
 def export(cfg: DictConfig) -> None:
-    """Export a checkpoint in the formats asked for.
+    """Export a checkpoint in the configured formats.
 
     Args:
-        cfg: what conf/export.yaml and the command line compose to.
+        cfg: the configuration; see :class:`ExportOptions`.
 
     Raises:
-        HudepthError: with one line for the user; formats that were good before it are kept.
+        HudepthError: with one line for the user; formats exported before the error are kept.
     """
     config = plain(cfg)
-    formats = several("format", config["format"], FORMATS)
-    tolerance_mm = _tolerance(config["tolerance_mm"])
-    for key in ("compared", "calibration"):
-        whole_number(config, key, default=50, least=1)
-    checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
-    net = checkpoint.build_net(trust=config["trust"])
-    info = info_of(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size_option(config["size"]))
-    reference = _backend(net, info)  # as it was trained: what is exported is held against that
-    info = replace(info, processing=bool(config["processing"]))
-    images = export_images(checkpoint, config, size=info.size)
-    output = output_folder(config["output"])
-    if "bundle" in formats:
-        _bundle_name(checkpoint, config, output)  # not after minutes
+    options = parse(ExportOptions, {**config, **config["paths"]})
+    if "int8" in options.format:
+        check_calibration(options.calibration)
+    checkpoint = load_checkpoint(options.checkpoint, runs=options.runs)
+    net = checkpoint.build_net(trust=options.trust)
+    info = ModelInfo.of_checkpoint(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=options.size)
+    torch.set_num_threads(usable_cores())
+    reference = TorchBackend(net, info, device=torch.device("cpu"))
+    images = find_images(
+        checkpoint, folder=options.images, size=info.size, compared=options.compared, calibration=options.calibration,
+        data={"cache": options.cache, **options.data}, trust=options.trust,
+    )  # fmt: skip
+    output = output_folder(options.output)
+    if "bundle" in options.format:
+        _bundle_name(checkpoint, options)  # before minutes of work
     log.info(
         "%s of %s parameters, %d x %d; compared on %d %s",
         info.name, f"{info.parameters:,}", *info.size, len(images.compared), images.origin,
     )  # fmt: skip
+    info = replace(info, processing=options.processing)
     record: dict[str, Any] = {}
     try:
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=output) as made:
-            work = Work(checkpoint, inference_form(net, size=info.size), reference, info, images, config, Path(made))
-            for name in formats:
-                record[name] = MAKERS[name](work, output, tolerance_mm)
+        with tempfile.TemporaryDirectory(prefix=".export-", dir=output) as folder:
+            net = inference_form(net, size=info.size)
+            work = Work(options, checkpoint, net, reference, info, images, output, Path(folder))
+            for name in options.format:
+                record[name] = MAKERS[name](work)
     except OSError as error:
-        raise ConfigError(f"output: cannot write to '{output}' ({error.strerror or error}). Make space.") from error
+        raise ConfigError(
+            f"output: cannot write to '{output}' ({error.strerror or error}). Free some space."
+        ) from error
     finally:
         if record:
             write_json(output / "export.json", {"images": images.origin, **record})
 
 
-def _onnx(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
+def _onnx(work: Work) -> dict[str, Any]:
     path = work.folder / "model.onnx"
-    if work.info.processing:
-        shutil.copyfile(work.onnx(), path)
-    else:
-        export_onnx(work.net, path, info=work.info)
-    parity = _compared(work, path, backend="onnxruntime", tolerance_mm=tolerance_mm)
-    return _keep([path], output, parity)
+    shutil.copyfile(work.configured_onnx, path)
+    return work.keep(path, parity=work.compare(path, backend="onnxruntime"))
 
 
-def _torch_export(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
+def _torch_export(work: Work) -> dict[str, Any]:
     path = work.folder / "model.pt2"
     export_program(work.net, path, info=work.info)
-    return _keep([path], output, _compared(work, path, backend="torch", tolerance_mm=tolerance_mm))
+    return work.keep(path, parity=work.compare(path, backend="torch"))
 
 
-def _openvino(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
-    path, onnx = work.folder / "model.xml", work.folder / "for_openvino.onnx"
-    if work.info.processing:
-        onnx = work.onnx()
-    else:
-        export_onnx(work.net, onnx, info=work.info)
-    export_openvino(onnx, path, info=work.info)
-    parity = _compared(work, path, backend="openvino", tolerance_mm=tolerance_mm)
-    return _keep([path, path.with_suffix(".bin")], output, parity)
+def _openvino(work: Work) -> dict[str, Any]:
+    path = work.folder / "model.xml"
+    export_openvino(work.configured_onnx, path, info=work.info)
+    return work.keep(path, path.with_suffix(".bin"), parity=work.compare(path, backend="openvino"))
 
 
-def _int8(work: Work, output: Path, _tolerance_mm: float) -> dict[str, Any]:
-    check_calibration(len(work.images.calibration))
-    path, info = work.folder / "model_int8.xml", replace(work.info, processing=True)
-    quantise(work.onnx(), path, info=info, images=work.images.calibration)
-    backend = open_exported(path, backend="openvino", threads=usable_cores(), trust=[], precision="float32")
-    parity = compare(backend, work.reference, work.images.compared)
+def _int8(work: Work) -> dict[str, Any]:
+    options, images = work.options, work.images
+    check_calibration(len(images.calibration))
+    path = work.folder / "model_int8.xml"
+    quantise(work.onnx, path, info=replace(work.info, processing=True), images=images.calibration)
+    quantised = open_exported(path, backend="openvino", threads=usable_cores(), trust=[])
+    parity = compare(quantised, work.reference, images.compared)
     accuracy: dict[str, Any] = {}
-    if work.config["accuracy"] and work.images.datamodule is not None:
-        accuracy = int8_accuracy(work.checkpoint, work.reference, backend, work.images.datamodule, config=work.config)
-    elif work.config["accuracy"]:
-        log.warning("int8: its loss of accuracy is not measured, since the checkpoint's data is not here.")
-    kept = _keep([path, path.with_suffix(".bin")], output, parity)
-    return {**kept, "calibrated_on": len(work.images.calibration), "accuracy": accuracy}
+    if options.accuracy and images.datamodule is not None:
+        accuracy = measure_int8(
+            work.checkpoint, work.reference, quantised, images.datamodule,
+            protocols=options.protocol, trust=options.trust,
+        )  # fmt: skip
+    elif options.accuracy:
+        log.warning("int8: its loss of accuracy was not measured, since the checkpoint's data is not here.")
+    kept = work.keep(path, path.with_suffix(".bin"), parity=parity)
+    return {**kept, "calibrated_on": len(images.calibration), "accuracy": accuracy}
 
 
-def _bundle(work: Work, output: Path, tolerance_mm: float) -> dict[str, Any]:
-    name = _bundle_name(work.checkpoint, work.config, output)
-    info = replace(work.info, processing=True)
-    if work.config["half"]:
-        kept = halved(work.checkpoint)
-        net = kept.build_net(trust=work.config["trust"])
-        onnx, parity = None, compare(_backend(net, work.info), work.reference, work.images.compared)
+def _bundle(work: Work) -> dict[str, Any]:
+    options, images = work.options, work.images
+    name = _bundle_name(work.checkpoint, options)
+    if options.half:
+        kept, onnx = halve(work.checkpoint), None
+        halved = TorchBackend(kept.build_net(trust=options.trust), work.info, device=torch.device("cpu"))
+        parity = compare(halved, work.reference, images.compared)
     else:
-        kept, onnx = work.checkpoint, work.onnx()
-        parity = _compared(work, onnx, backend="onnxruntime", tolerance_mm=tolerance_mm)
+        kept, onnx = work.checkpoint, work.onnx
+        parity = work.compare(onnx, backend="onnxruntime")
     model = DepthModel(work.reference)
-    samples = [model.predict(image) for image in work.images.compared[:: max(1, len(work.images.compared) // 3)][:3]]
-    results = _results(work.checkpoint)
+    samples = [model.predict(image) for image in images.compared[:: max(1, len(images.compared) // 3)][:3]]
+    results = _read_results(work.checkpoint)
+    info, folder = replace(work.info, processing=True), work.folder / name
     card = model_card(
-        work.checkpoint, info, name=name, results=results, parity=str(parity), half=bool(work.config["half"]),
-        samples=f"## Samples\n\n{_pictures(len(samples))}\n\nFrom the {work.images.origin}, not picked by "
-        "hand. Left the image at the network's size, right its depth.",
+        work.checkpoint, info, name=name, results=results, parity=str(parity), half=options.half,
+        samples=len(samples), origin=images.origin,
     )  # fmt: skip
-    folder = work.folder / name
     write_bundle(folder, kept, info=info, onnx=onnx, card=card, results=results, samples=samples)
-    if work.config["zip"]:
+    if options.zip:
         zip_folder(folder, work.folder / f"{name}.zip")
-        return _keep([work.folder / f"{name}.zip"], output, parity)
-    return _keep([folder], output, parity)
+        folder = work.folder / f"{name}.zip"
+    return work.keep(folder, parity=parity)
 
 
-def _bundle_name(checkpoint: Checkpoint, config: dict[str, Any], output: Path) -> str:
-    name = str(config["name"] or checkpoint.config.get("name") or checkpoint.config["model"]["_target_"].split(".")[-1])
-    if not name or name != Path(name).name or name.startswith("."):
-        raise ConfigError(f"name: '{name}' is no name for a folder. Pass name=my_model.")
-    if not config["zip"] and (output / name).exists():
-        raise ConfigError(f"'{output / name}' exists. Remove it, or pass another name= or output=.")
-    return name
-
-
-def _pictures(count: int) -> str:
-    return "\n".join(f"![image and predicted depth](samples/{number}.jpg)" for number in range(count))
-
-
-MAKERS: dict[str, Callable[[Work, Path, float], dict[str, Any]]] = {
+MAKERS: dict[str, Callable[[Work], dict[str, Any]]] = {
     "onnx": _onnx, "torch_export": _torch_export, "openvino": _openvino, "int8": _int8, "bundle": _bundle,
 }  # fmt: skip
 
 
-def _compared(work: Work, path: Path, *, backend: str, tolerance_mm: float) -> Parity:
-    opened = open_exported(path, backend=backend, threads=usable_cores(), trust=[PT2], precision="float32")
-    parity = compare(opened, work.reference, work.images.compared)
-    check(parity, what=path.name, tolerance_mm=tolerance_mm)
-    return parity
+def _bundle_name(checkpoint: Checkpoint, options: ExportOptions) -> str:
+    config = checkpoint.config
+    name = str(options.name or config.get("name") or config["model"]["_target_"].split(".")[-1])
+    if name != Path(name).name or name.startswith("."):
+        raise ConfigError(f"name: '{name}' cannot name a folder. Pass name=my_model.")
+    folder = Path(options.output).expanduser() / name
+    if not options.zip and folder.exists():
+        raise ConfigError(f"'{folder}' exists. Remove it, or pass another name= or output=.")
+    return name
 
 
-def _keep(paths: list[Path], output: Path, parity: Parity) -> dict[str, Any]:
-    """Move what is good to where it was asked for."""
-    for path in paths:
-        path.replace(output / path.name)
-    log.info("%s: %s", output / paths[0].name, parity)
-    return {
-        "files": [path.name for path in paths],
-        "compared": {"images": parity.images, "worst_mm": parity.worst_mm, "mean_mm": parity.mean_mm},
-    }
-
-
-def _results(checkpoint: Checkpoint) -> dict[str, dict[str, Any]]:
-    """Return what the run's own tests wrote, by protocol."""
+def _read_results(checkpoint: Checkpoint) -> dict[str, dict[str, Any]]:
+    """Return the results of the run's own tests, by protocol."""
     if checkpoint.run is None:
         return {}
     files = sorted((checkpoint.run / "test").glob("*/metrics.json"))
     return {file.parent.name: json.loads(file.read_text(encoding="utf-8")) for file in files}
-
-
-def _tolerance(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise ConfigError(f"tolerance_mm: {value} is no positive number of millimetres. Leave it out for 1.")
-    return float(value)
-
-
-def _backend(net: Any, info: ModelInfo) -> TorchBackend:
-    import torch
-
-    torch.set_num_threads(usable_cores())
-    return TorchBackend(net, info, device=torch.device("cpu"))

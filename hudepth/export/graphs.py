@@ -1,4 +1,4 @@
-"""The network as a file for other programs: ONNX, ``torch.export``, OpenVINO."""
+"""Write the network as ONNX, ``torch.export`` or OpenVINO."""
 
 from __future__ import annotations
 
@@ -15,23 +15,18 @@ from torch import Tensor, nn
 
 from hudepth import __version__
 from hudepth.base.files import written_whole
-from hudepth.inference.info import KEY, ModelInfo
+from hudepth.inference.model_info import KEY, ModelInfo
 from hudepth.inference.pipeline import DepthPipeline
 from hudepth.inference.runtimes import package
 
 OPSET = 18
 INPUT = "image"
 OUTPUTS = {True: "depth_m", False: "unit_depth"}
-"""Name of the output, by whether the graph holds the processing."""
+"""Name of the output, by whether the graph includes pre- and post-processing."""
 
 
 def export_graph(net: nn.Module, info: ModelInfo) -> tuple[nn.Module, Tensor]:
-    """Return what is exported, and an input for it.
-
-    Args:
-        net: normalised image to unit depth, as it shall run.
-        info: its size, and whether the processing is to be part of the graph.
-    """
+    """Return the module to export and an example input; ``info`` states whether processing is part of the graph."""
     height, width = info.size
     if info.processing:
         image = torch.randint(0, 256, (2, height, width, 3), dtype=torch.uint8)
@@ -40,7 +35,7 @@ def export_graph(net: nn.Module, info: ModelInfo) -> tuple[nn.Module, Tensor]:
 
 
 def describe(info: ModelInfo) -> dict[str, str]:
-    """Return what a file says to people and programs that do not know hudepth, and hudepth's own description."""
+    """Return the metadata of a file: hudepth's own description, and one for people and other programs."""
     height, width = info.size
     if info.processing:
         takes = f"{INPUT}: uint8 [batch, {height}, {width}, 3], RGB, the whole image resized to this size"
@@ -62,12 +57,12 @@ def describe(info: ModelInfo) -> dict[str, str]:
 
 
 def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
-    """Write an ONNX file with any batch size, by torch's dynamo exporter.
+    """Write an ONNX file for any batch size, with torch's dynamo exporter.
 
     Args:
         net: normalised image to unit depth.
         path: ``.onnx``, written whole or not at all.
-        info: what the file says of itself.
+        info: its description.
 
     Raises:
         ConfigError: if ``onnx`` or ``onnxscript`` is not installed.
@@ -91,38 +86,37 @@ def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
 
 
 def export_program(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
-    """Write a ``torch.export`` program with any batch size.
+    """Write a ``torch.export`` program for any batch size.
 
     Args:
         net: normalised image to unit depth.
         path: ``.pt2``, written whole or not at all.
-        info: what the file says of itself.
+        info: its description.
     """
     graph, image = export_graph(net, info)
     with _quiet(), torch.no_grad():
         program = torch.export.export(graph, (image,), dynamic_shapes=({0: torch.export.Dim("batch", min=1)},))
-        # saving looks at the ending, so the part is written under one that it likes
         with written_whole(path) as part:
-            under = part.with_suffix(".pt2")
+            renamed = part.with_suffix(".pt2")  # torch requires this ending
             try:
-                torch.export.save(program, under, extra_files={f"{KEY}.json": info.to_json()})
-                under.replace(part)
+                torch.export.save(program, renamed, extra_files={f"{KEY}.json": info.to_json()})
+                renamed.replace(part)
             finally:
-                under.unlink(missing_ok=True)
+                renamed.unlink(missing_ok=True)
 
 
 def export_openvino(onnx: Path, path: Path, *, info: ModelInfo) -> None:
-    """Turn an ONNX file into OpenVINO's format, with float32 weights.
+    """Convert an ONNX file to OpenVINO's format, with float32 weights.
 
     Args:
-        onnx: what :func:`export_onnx` wrote.
-        path: ``.xml``; the weights go into a ``.bin`` beside it.
-        info: what the file says of itself.
+        onnx: a file that :func:`export_onnx` wrote.
+        path: ``.xml``; the weights go into a ``.bin`` next to it.
+        info: its description.
 
     Raises:
         ConfigError: if ``openvino`` is not installed.
     """
-    save_openvino(openvino().Core().read_model(onnx), path, info=info)
+    save_openvino(package("openvino", extra="openvino").Core().read_model(onnx), path, info=info)
 
 
 def save_openvino(model: Any, path: Path, *, info: ModelInfo) -> None:
@@ -130,29 +124,21 @@ def save_openvino(model: Any, path: Path, *, info: ModelInfo) -> None:
     for key, value in describe(info).items():
         model.set_rt_info(value, [key])
     path.parent.mkdir(parents=True, exist_ok=True)
-    openvino().save_model(model, path, compress_to_fp16=False)  # half precision would cost more than a millimetre
-
-
-def openvino() -> Any:
-    """Return the package.
-
-    Raises:
-        ConfigError: if it is not installed.
-    """
-    return package("openvino", extra="openvino")
+    openvino = package("openvino", extra="openvino")
+    openvino.save_model(model, path, compress_to_fp16=False)  # half precision would cost more than a millimetre
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the exporter's talk about packages that are not needed to itself."""
-    names = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")
-    levels = {name: logging.getLogger(name).level for name in names}
+    """Hide the exporter's remarks about optional packages."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            for name in names:
-                logging.getLogger(name).setLevel(logging.ERROR)
+            for logger in loggers:
+                logger.setLevel(logging.ERROR)
             yield
         finally:
-            for name, level in levels.items():
-                logging.getLogger(name).setLevel(level)
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)

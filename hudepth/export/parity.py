@@ -1,4 +1,4 @@
-"""Whether an exported file predicts what its checkpoint does, on real images."""
+"""Compare an exported file with its checkpoint on real images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hudepth.inference.backends import Backend
 
 @dataclass(frozen=True)
 class Parity:
-    """How far an exported file is from its checkpoint."""
+    """Difference between an exported file and its checkpoint."""
 
     images: int
     worst_mm: float
@@ -31,10 +31,10 @@ def compare(
     """Predict the same images twice.
 
     Args:
-        exported: the file, opened as a user would open it.
+        exported: the file.
         reference: the checkpoint.
         images: RGB at the model's size.
-        batch_size: images at a time; more than one, so that the batch axis is tried, too.
+        batch_size: images at a time; more than one also tests the batch axis.
     """
     worst, total = 0.0, 0.0
     for at in range(0, len(images), batch_size):
@@ -46,13 +46,13 @@ def compare(
 
 
 def check(parity: Parity, *, what: str, tolerance_mm: float) -> None:
-    """Refuse a file that is too far away.
+    """Refuse a file whose difference exceeds the tolerance.
 
     Raises:
-        CheckpointError: if it is.
+        CheckpointError: if it does.
     """
     if not parity.worst_mm <= tolerance_mm:
         raise CheckpointError(
-            f"{what}: {parity.worst_mm:.3g} mm from the checkpoint at the worst pixel, allowed are {tolerance_mm:g}. "
-            f"It is not kept; pass tolerance_mm={parity.worst_mm * 1.1:.2g} to keep it all the same."
+            f"{what}: {parity.worst_mm:.3g} mm from the checkpoint at the worst pixel, the limit is {tolerance_mm:g}. "
+            f"The file was not kept; pass tolerance_mm={parity.worst_mm * 1.1:.2g} to accept it."
         )

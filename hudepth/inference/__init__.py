@@ -1,1 +1,1 @@
-"""A trained model in use: images in, depth in metres out, whatever file the model comes from."""
+"""Prediction with a trained model: images in, depth in metres out, from any model file."""

@@ -1,4 +1,4 @@
-"""A predicted depth map, and the forms people want it in."""
+"""A predicted depth map, and its conversion to files, pictures and points."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ FAST_PNG = (
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP,
 )  # fmt: skip
-"""A fifth larger than by OpenCV's defaults, in half the time, which counts beside a network that takes 50 ms."""
+"""A fifth larger than with OpenCV's defaults, in half the time, which counts next to a network that takes 50 ms."""
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of an image, pixel by pixel."""
+    """The depth of each pixel of an image."""
 
     metres: Float[np.ndarray, "h w"]
     """Distance along the optical axis [m], float32."""
     image: UInt8[np.ndarray, "h w 3"]
     """The image it was predicted from, upright, RGB."""
     max_depth_m: float
-    """The largest depth the model can tell."""
+    """Maximum depth the model can predict [m]."""
     notes: tuple[str, ...] = ()
-    """What was done to the image on the way in, where it is not obvious."""
+    """What reading changed in the image, if it is not obvious."""
 
     def to_png16(self) -> bytes:
-        """Return a 16-bit PNG file in millimetres: the form in which NYU, ScanNet and Kinect tools keep depth.
+        """Return a 16-bit PNG file in millimetres, the format of NYU, ScanNet and Kinect tools.
 
-        Depth is rounded to the nearest millimetre and ends at 65.535 m.
+        Depth is rounded to the nearest millimetre and limited to 65.535 m.
         """
         return cv2.imencode(".png", to_mm(self.metres), FAST_PNG)[1].tobytes()
 
@@ -46,8 +46,8 @@ class DepthMap:
         """Return depth as RGB colours, near red and far blue, on a fixed scale with a legend in metres.
 
         Args:
-            scale_m: depths of the two ends of the scale; from 0 to ``max_depth_m`` by default.
-            legend: whether the scale stands beside it.
+            scale_m: depths of the two ends of the scale; default: 0 to ``max_depth_m``.
+            legend: whether to append the scale.
 
         Raises:
             ConfigError: if the scale is not two rising numbers.
@@ -59,13 +59,13 @@ class DepthMap:
         return np.hstack([self.image, self.colourise(scale_m=scale_m)])
 
     def point_cloud(self, intrinsics: Intrinsics | tuple[float, float, float, float] | None = None) -> PointCloud:
-        """Return a coloured point in space for each pixel.
+        """Return one coloured point per pixel.
 
         Args:
-            intrinsics: fx, fy, cx, cy of the camera [pixels of the image]; NYU's scaled to the image by default.
+            intrinsics: fx, fy, cx, cy of the camera [pixels of the image]; default: NYU's, scaled to the image.
 
         Raises:
-            ConfigError: if they are no camera's.
+            ConfigError: if they are not those of a camera.
         """
         camera = Intrinsics(*intrinsics) if isinstance(intrinsics, tuple) else intrinsics
         return point_cloud(self.metres, self.image, camera)

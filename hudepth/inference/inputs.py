@@ -1,8 +1,9 @@
-"""What ``input=`` means: one image, a folder, a pattern, a video, or the number of a camera."""
+"""Find the inputs that ``input=`` names: an image, a folder, a pattern, a video, or the number of a camera."""
 
 from __future__ import annotations
 
 import glob
+import itertools
 from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
@@ -15,15 +16,15 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 
 
 class Item(NamedTuple):
-    """A file to predict, and what its results are called."""
+    """A file to predict, and the name of its results."""
 
     path: Path
     stem: Path
-    """Below the output folder, without an ending."""
+    """Relative to the output folder, without an ending."""
 
 
 class Inputs(NamedTuple):
-    """What there is to do."""
+    """What to predict."""
 
     images: list[Item]
     videos: list[Item]
@@ -31,14 +32,14 @@ class Inputs(NamedTuple):
 
 
 def find_inputs(spec: str, *, recursive: bool) -> Inputs:
-    """Return what ``spec`` means, in the order of names.
+    """Return the files or camera that ``spec`` names, sorted by name.
 
     Args:
         spec: a file, a folder, a pattern with ``*``, ``?`` or ``**``, or the number of a camera.
-        recursive: whether folders below a folder are looked into; their names are kept in the results.
+        recursive: whether to search subfolders; their names are kept in the results.
 
     Raises:
-        DataError: if there is nothing; the message says what was looked for.
+        DataError: if there is nothing to predict.
     """
     if spec.isdecimal() and not Path(spec).exists():
         return Inputs([], [], camera=int(spec))
@@ -56,10 +57,10 @@ def find_inputs(spec: str, *, recursive: bool) -> Inputs:
             )
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
-    alone = path.is_file()  # who names one file means it, whatever its ending
+    alone = path.is_file()  # a file that is named is read, whatever its ending
     images = [f for f in files if f not in videos and (alone or f.suffix.lower() in SUFFIXES)]
     if not images and not videos:
-        below = "" if recursive else " Folders below it are looked into with recursive=true."
+        below = "" if recursive else " Pass recursive=true to search subfolders."
         raise DataError(
             f"input: no image or video in '{spec}' ({', '.join(SUFFIXES)}, {', '.join(VIDEO_SUFFIXES)}).{below}"
         )
@@ -68,16 +69,11 @@ def find_inputs(spec: str, *, recursive: bool) -> Inputs:
 
 
 def _root_of(pattern: Path) -> Path:
-    parts = []
-    for part in pattern.parts[:-1]:
-        if glob.has_magic(part):
-            break
-        parts.append(part)
-    return Path(*parts)
+    return Path(*itertools.takewhile(lambda part: not glob.has_magic(part), pattern.parts[:-1]))
 
 
 def _named(files: list[Path], root: Path) -> list[Item]:
-    """Name results after their files; where two differ in the ending alone, the ending becomes part of the name."""
+    """Name results after their files; if two differ only in the ending, it becomes part of the name."""
     stems = [file.relative_to(root).with_suffix("") for file in files]
     times = Counter(stems)
     return [

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,11 +15,13 @@ from PIL import Image
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.images import Photo, as_rgb, read_photo
-from hudepth.base.machine import usable_cores
-from hudepth.inference.backends import EXPORTED, Backend, check_backend, open_exported, torch_backend
+from hudepth.base.machine import torch_device, usable_cores
+from hudepth.base.options import Choice, Range, Size, parse
+from hudepth.inference.backends import EXPORTED, Backend, BackendName, TorchBackend, open_exported
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.fit import Fitted, check_fit, fit_image, unfit_depth
-from hudepth.inference.info import ModelInfo
+from hudepth.inference.image_fit import Fit, Fitted, fit_image, unfit_depth
+from hudepth.inference.model_info import ModelInfo
+from hudepth.inference.runtimes import PRECISIONS
 from hudepth.runs.checkpoint import load_checkpoint
 
 Picture = str | Path | bytes | NDArray[Any] | Image.Image
@@ -26,7 +29,7 @@ Picture = str | Path | bytes | NDArray[Any] | Image.Image
 
 
 class Prepared(NamedTuple):
-    """An image on its way to the network."""
+    """A decoded image, and what the network sees of it."""
 
     photo: Photo
     fitted: Fitted
@@ -37,19 +40,17 @@ class DepthModel:
 
     Args:
         backend: what computes.
-        fit: how an image comes to the network's size; see :data:`hudepth.inference.fit.FITS`.
+        fit: how an image is resized to the network's input.
         flip: average with the mirrored image's prediction, which takes twice the time.
-
-    Raises:
-        ConfigError: if there is no such fit.
     """
 
-    def __init__(self, backend: Backend, *, fit: str = "stretch", flip: bool = False) -> None:
-        self.backend, self.fit, self.flip = backend, check_fit(fit), flip
+    def __init__(self, backend: Backend, *, fit: Fit = "stretch", flip: bool = False) -> None:
+        self.backend, self.flip = backend, flip
+        self.fit: Fit = fit
 
     @property
     def info(self) -> ModelInfo:
-        """What the model is, and what it was trained on."""
+        """Description of the model and its training."""
         return self.backend.info
 
     def predict(self, image: Picture) -> DepthMap:
@@ -68,7 +69,7 @@ class DepthModel:
         """Predict the depth of several images.
 
         Args:
-            images: as :meth:`predict` takes them.
+            images: see :meth:`predict`.
             batch_size: images that go through the network together.
 
         Raises:
@@ -79,7 +80,7 @@ class DepthModel:
         return [self.finish(each, depth) for each, depth in zip(prepared, depths, strict=True)]
 
     def prepare(self, image: Picture) -> Prepared:
-        """Decode an image and bring it to the network's size.
+        """Decode an image and resize it to the network's input.
 
         Raises:
             DataError: if it cannot be read.
@@ -100,10 +101,26 @@ class DepthModel:
         return mean
 
     def finish(self, prepared: Prepared, depth_m: Float[np.ndarray, "h w"]) -> DepthMap:
-        """Bring the network's depth to the image's size."""
+        """Resize the network's depth to the image's size."""
         rgb = prepared.photo.rgb
         metres = unfit_depth(depth_m, prepared.fitted.box, (rgb.shape[0], rgb.shape[1]))
         return DepthMap(metres, rgb, self.info.max_depth_m, prepared.photo.notes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Which model predicts, and how; see :func:`load`."""
+
+    checkpoint: str
+    runs: Path = Path("runs")
+    backend: BackendName = "auto"
+    device: str = "auto"
+    precision: Annotated[str, Choice(tuple(PRECISIONS))] = "float32"
+    threads: Annotated[int, Range(1)] | None = None
+    size: Size | None = None
+    fit: Fit = "stretch"
+    flip: bool = False
+    trust: list[str] = field(default_factory=list)
 
 
 def load(
@@ -113,7 +130,7 @@ def load(
     device: str = "auto",
     precision: str = "float32",
     threads: int | None = None,
-    size: tuple[int, int] | None = None,
+    size: tuple[int, int] | int | None = None,
     fit: str = "stretch",
     flip: bool = False,
     trust: Iterable[str] = (),
@@ -122,56 +139,56 @@ def load(
     """Load a model to predict with.
 
     Args:
-        spec: a checkpoint, run directory, bundle (folder or zip), exported ``.onnx``, ``.xml`` or ``.pt2`` file, or
-            ``last`` for the newest run.
-        backend: ``auto``, or what shall run an exported file: ``onnxruntime``, ``openvino`` or ``torch``.
-        device: ``auto`` (a GPU if there is one), ``cpu``, ``cuda`` or ``mps``; checkpoints alone can choose.
-        precision: ``float32``, or ``bfloat16`` in OpenVINO, which is faster and not exact.
-        threads: to compute with on a CPU; the cores this process may use by default.
-        size: (height, width) of the network's input; that of the training by default. Exported files have theirs.
+        spec: ``nyu`` (the bundled pretrained model), a checkpoint, run directory, bundle (folder or zip), exported
+            ``.onnx``, ``.xml`` or ``.pt2`` file, or ``last`` for the newest run.
+        backend: what runs an exported file: ``onnxruntime``, ``openvino``, ``torch``, or ``auto``.
+        device: ``cpu``, ``cuda``, ``mps``, or ``auto`` (a GPU if there is one); for checkpoints only.
+        precision: ``float32``, or ``bfloat16`` in OpenVINO, which is faster but not exact.
+        threads: to compute with on a CPU; default: the cores this process may use.
+        size: (height, width) of the network's input; default: that of its training. Exported files have a fixed one.
         fit: ``stretch`` or ``letterbox``.
         flip: average with the mirrored image's prediction: a little better, twice the time.
         trust: further packages whose classes a checkpoint may name; ``pt2`` to load a ``.pt2`` file.
         runs: where ``last`` looks.
 
     Raises:
-        CheckpointError: if it is missing, damaged, not trusted, or no model of hudepth's.
+        CheckpointError: if it is missing, damaged, not trusted, or not a model of hudepth.
         ConfigError: if an option does not fit.
     """
-    check_fit(fit)
-    check_backend(backend, precision)
-    count = usable_cores() if threads is None else threads
-    if count < 1:
-        raise ConfigError(f"threads: {count} is less than 1. Leave it out for {usable_cores()}.")
-    path, names = Path(spec).expanduser(), list(trust)
+    values = {
+        "checkpoint": str(spec), "backend": backend, "device": device, "precision": precision, "threads": threads,
+        "size": size, "fit": fit, "flip": flip, "trust": list(trust), "runs": runs,
+    }  # fmt: skip
+    return load_model(parse(ModelOptions, values))
+
+
+def load_model(chosen: ModelOptions) -> DepthModel:
+    """Load the model that the options name; raises as :func:`load` does."""
+    path, threads = Path(chosen.checkpoint).expanduser(), chosen.threads or usable_cores()
+    backend: Backend
     if path.suffix.lower() in EXPORTED and not path.is_dir():
-        if size is not None:
-            raise ConfigError(f"size: '{path.name}' has the size it was exported with. Leave it out.")
+        if chosen.size is not None:
+            raise ConfigError(f"size: '{path.name}' has a fixed size. Leave size out.")
         if not path.is_file():
             raise ConfigError(
                 f"checkpoint: no file '{path}'. Pass a checkpoint, run directory, bundle or exported file."
             )
-        torch.set_num_threads(count)
-        exported = open_exported(path, backend=backend, threads=count, trust=names, precision=precision)
-        return DepthModel(exported, fit=fit, flip=flip)
-    if backend not in ("auto", "torch") or precision != "float32":
-        what = f"backend={backend}" if backend not in ("auto", "torch") else f"precision={precision}"
-        raise ConfigError(
-            f"{what}: needs an exported file. Run hudepth-export checkpoint={spec} format=openvino first."
+        torch.set_num_threads(threads)
+        backend = open_exported(
+            path, backend=chosen.backend, threads=threads, trust=chosen.trust, precision=chosen.precision
         )
-    where = _device(device)
-    if where.type == "cpu":
-        torch.set_num_threads(count)
-    checkpoint = load_checkpoint(str(spec), runs=runs)
-    return DepthModel(torch_backend(checkpoint, device=where, trust=names, size=size), fit=fit, flip=flip)
-
-
-def _device(name: str) -> torch.device:
-    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if name == "auto":
-        name = next(kind for kind in ("cuda", "mps", "cpu") if there[kind])
-    if not there.get(name):
-        raise ConfigError(
-            f"device: no '{name}' here. Pass device={' or '.join(k for k, is_there in there.items() if is_there)}."
-        )
-    return torch.device(name)
+        return DepthModel(backend, fit=chosen.fit, flip=chosen.flip)
+    for key, value, usable in (
+        ("backend", chosen.backend, ("auto", "torch")), ("precision", chosen.precision, ("float32",)),
+    ):  # fmt: skip
+        if value not in usable:
+            raise ConfigError(
+                f"{key}={value}: needs an exported file. Run hudepth-export checkpoint={chosen.checkpoint} "
+                "format=openvino first."
+            )
+    device = torch_device(chosen.device)
+    if device.type == "cpu":
+        torch.set_num_threads(threads)
+    checkpoint = load_checkpoint(chosen.checkpoint, runs=chosen.runs)
+    backend = TorchBackend.of_checkpoint(checkpoint, device=device, trust=chosen.trust, size=chosen.size)
+    return DepthModel(backend, fit=chosen.fit, flip=chosen.flip)

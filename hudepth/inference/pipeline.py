@@ -1,4 +1,4 @@
-"""The network with what lies before and behind it: bytes in, metres out. The graph that is exported, too."""
+"""The network with its pre- and post-processing: bytes in, metres out. This is also the graph that is exported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class DepthPipeline(nn.Module):
 
     Args:
         net: normalised image to unit depth.
-        max_depth_m: what unit depth 1 stands for.
+        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
     """
 
     def __init__(self, net: nn.Module, *, max_depth_m: float) -> None:

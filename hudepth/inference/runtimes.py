@@ -1,4 +1,4 @@
-"""How exported graphs are opened, once for predicting and for measuring. PyTorch is not imported here."""
+"""Open exported graphs in ONNX Runtime and OpenVINO, for prediction and benchmarks. PyTorch is not imported here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from hudepth.base.errors import ConfigError
 
 PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
-"""In which OpenVINO computes, and its own names of them; bfloat16 is not exact."""
+"""Precisions of OpenVINO, and its own names for them; bfloat16 is not exact."""
 
 
 def onnx_session(path: Path, *, threads: int) -> Any:
@@ -17,7 +17,7 @@ def onnx_session(path: Path, *, threads: int) -> Any:
 
     Raises:
         ConfigError: if ONNX Runtime is not installed.
-        Exception: whatever it says of a file that it cannot read.
+        Exception: whatever ONNX Runtime raises for a file that it cannot read.
     """
     runtime = package("onnxruntime", extra="onnx")
     options = runtime.SessionOptions()
@@ -27,19 +27,19 @@ def onnx_session(path: Path, *, threads: int) -> Any:
 
 
 def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:
-    """Open an IR or ONNX file in OpenVINO, on the CPU.
+    """Open an IR (``.xml`` next to its ``.bin``) or ONNX file in OpenVINO, on the CPU.
 
     Args:
-        path: ``.xml`` with its ``.bin`` beside it, or ``.onnx``.
+        path: the file.
         threads: to compute with.
-        precision: of :data:`PRECISIONS`.
+        precision: a key of :data:`PRECISIONS`.
 
     Returns:
-        The model as it was read, and a request that computes it.
+        The model as read, and an inference request.
 
     Raises:
         ConfigError: if OpenVINO is not installed.
-        Exception: whatever it says of a file that it cannot read.
+        Exception: whatever OpenVINO raises for a file that it cannot read.
     """
     core = package("openvino", extra="openvino").Core()
     options = {

@@ -1,4 +1,4 @@
-"""Many images through one model: decoding and writing beside its computing, or between, where that is faster."""
+"""Run many images through one model, decoding and writing while it computes or in between, whichever is faster."""
 
 from __future__ import annotations
 
@@ -19,36 +19,35 @@ from hudepth.inference.model import DepthModel, Picture, Prepared
 
 Key = TypeVar("Key")
 LOT = 8
-"""Images that are decoded, predicted and written together, for each thread: few enough for memory."""
+"""Images per thread that are decoded, predicted and written together: few enough for memory."""
 
 
 @dataclass
 class Tally:
-    """What came of a stream."""
+    """The results of a stream."""
 
     done: int = 0
     failed: dict[str, str] = field(default_factory=dict)
-    """What could not be read, and why."""
+    """Images that could not be read, and why."""
     notes: dict[str, str] = field(default_factory=dict)
-    """What was predicted, but not as one might think."""
+    """Remarks on images that were predicted."""
 
 
 class Stream(Generic[Key]):
     """Predicts images one after another, in order, a lot at a time.
 
-    A network on a CPU that has a thread for each core is slowed down by whatever runs beside it: its threads wait for
-    each other, so one that is held up holds up all. There the cores take turns: a lot is decoded, predicted, written.
-    Elsewhere (a GPU, cores to spare) a lot is written and the next one decoded while one is predicted.
+    A network that uses every core of a CPU is slowed down by any other work: its threads wait for each other, so one
+    delayed thread delays all. There the steps alternate: a lot is decoded, then predicted, then written. With a GPU or
+    spare cores (``overlap``), one lot is written and the next one decoded while another is predicted.
 
     Args:
         model: what predicts.
         write: called in a thread with each image's key and depth.
-        tally: where to count what came of it.
+        tally: where to count results.
         batch_size: images that go through the network together.
         workers: threads that decode and write; one keeps the order.
-        overlap: whether they work while the network does.
-        smoothing: of frames that follow each other: the share of the depth so far that is kept, from 0 (none) to less
-            than 1.
+        overlap: whether they work while the network computes.
+        smoothing: of consecutive frames: the weight of the previous depth, from 0 (none) to less than 1.
     """
 
     def __init__(
@@ -63,31 +62,30 @@ class Stream(Generic[Key]):
         smoothing: float = 0.0,
     ) -> None:
         self._model, self._write = model, write
-        self._batch_size, self._workers, self._smoothing = batch_size, workers, smoothing
-        self._overlap = overlap
-        self._so_far: Float[np.ndarray, "h w"] | None = None
+        self._batch_size, self._workers, self._overlap, self._smoothing = batch_size, workers, overlap, smoothing
+        self._previous: Float[np.ndarray, "h w"] | None = None
         self.tally = tally
 
     def run(self, pictures: Iterable[tuple[Key, Picture]]) -> Iterator[Key]:
-        """Predict and write; yield each key once its image is through the network or was found unreadable.
+        """Predict and write; yield each key once its image has been predicted or found unreadable.
 
         Args:
-            pictures: keys, whose text names an image in messages, and images. Images that cannot be read are noted in
-                ``tally`` and left out.
+            pictures: keys, which name an image in messages, and images. Unreadable images are noted in ``tally`` and
+                skipped.
 
         Raises:
-            OSError: if a result cannot be written; what was predicted before is kept.
+            OSError: if a result cannot be written; earlier results are kept.
         """
         with ThreadPoolExecutor(self._workers) as pool:
             writing: deque[Future[None]] = deque()
             try:
                 for lot in self._lots(pool, pictures):
                     jobs = []
-                    for key, job in self._predicted(lot):
+                    for key, job in self._predict(lot):
                         if job is not None:
                             jobs.append(job)
                         yield key
-                    _wait(writing)  # of the lot before
+                    _wait(writing)  # for the previous lot
                     writing.extend(pool.submit(job) for job in jobs)
                     if not self._overlap:
                         _wait(writing)
@@ -99,7 +97,7 @@ class Stream(Generic[Key]):
     def _lots(
         self, pool: ThreadPoolExecutor, pictures: Iterable[tuple[Key, Picture]]
     ) -> Iterator[list[tuple[Key, Prepared | DataError]]]:
-        """Yield decoded images in lots, the next of which is in the making where that is no hindrance."""
+        """Yield lots of decoded images; with ``overlap`` the next one is decoded meanwhile."""
         left = iter(pictures)
         size = max(LOT * self._workers, self._batch_size)
 
@@ -122,10 +120,8 @@ class Stream(Generic[Key]):
         except DataError as error:
             return error
 
-    def _predicted(
-        self, lot: list[tuple[Key, Prepared | DataError]]
-    ) -> Iterator[tuple[Key, Callable[[], None] | None]]:
-        """Yield each key of a lot with what is left to do for it."""
+    def _predict(self, lot: list[tuple[Key, Prepared | DataError]]) -> Iterator[tuple[Key, Callable[[], None] | None]]:
+        """Yield each key of a lot with the function that writes its depth, None if it is unreadable."""
         good: list[tuple[Key, Prepared]] = []
         for key, prepared in lot:
             if isinstance(prepared, DataError):
@@ -140,12 +136,12 @@ class Stream(Generic[Key]):
                 self.tally.done += 1
                 if prepared.photo.notes:
                     self.tally.notes[str(key)] = "; ".join(prepared.photo.notes)
-                yield key, partial(self._finish, key, prepared, self._smoothed(depth))
+                yield key, partial(self._finish, key, prepared, self._smooth(depth))
 
-    def _smoothed(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        if self._smoothing and self._so_far is not None:
-            depth = (self._smoothing * self._so_far + (1 - self._smoothing) * depth).astype(np.float32)
-        self._so_far = depth
+    def _smooth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        if self._smoothing and self._previous is not None:
+            depth = (self._smoothing * self._previous + (1 - self._smoothing) * depth).astype(np.float32)
+        self._previous = depth
         return depth
 
     def _finish(self, key: Key, prepared: Prepared, depth: Float[np.ndarray, "h w"]) -> None:

@@ -1,4 +1,4 @@
-"""Videos and cameras: frames in, frames out, never more than a few of them in memory."""
+"""Read frames of videos and cameras, and write videos, with only a few frames in memory at a time."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from jaxtyping import UInt8
 from hudepth.base.errors import DataError
 from hudepth.base.images import check_pixels
 
-# FFmpeg may open files and nothing else, whatever a playlist says, and does not talk; OpenCV looks when it opens one.
+# FFmpeg may open local files only, whatever a playlist names, and stays quiet; OpenCV reads these when it opens a file.
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
-USUAL_RATE = 25.0
-"""Frames a second of what does not tell."""
+DEFAULT_RATE = 25.0
+"""Frames per second where a source does not state its rate."""
 CODEC = "mp4v"
-"""MPEG-4 part 2: what every build of OpenCV can write."""
+"""MPEG-4 part 2, which every build of OpenCV can write."""
 
 
 class FrameReader:
@@ -36,71 +36,68 @@ class FrameReader:
 
     def __init__(self, source: Path | int) -> None:
         self.name = f"camera {source}" if isinstance(source, int) else f"'{source}'"
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # what it warns of is an error below
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # its warnings become errors below
         self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
         if not self._capture.isOpened():
             self._capture.release()
-            mend = (
-                "Pass the number of one that is connected."
-                if isinstance(source, int)
-                else "It is no video, or cut off before its index; convert it to .mp4."
+            if isinstance(source, int):
+                raise DataError(f"{self.name}: cannot be opened. Pass the number of a connected camera.")
+            raise DataError(
+                f"{self.name}: cannot be opened. It is not a video or is cut off before its index; convert it to .mp4."
             )
-            raise DataError(f"{self.name}: cannot be opened. {mend}")
         width, height = (int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         check_pixels(height, width, where=self.name)
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        self.rate = rate if 0 < rate < 1000 else USUAL_RATE
-        """Frames a second."""
+        self.rate = rate if 0 < rate < 1000 else DEFAULT_RATE
+        """Frames per second."""
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.expected = int(count) if not isinstance(source, int) and 0 < count < 1e9 else None
-        """How many frames the file says it has; None for a camera."""
+        """Number of frames that the file states; None for a camera."""
         self.read = 0
-        """How many have been read."""
+        """Number of frames read so far."""
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-        """Yield the frames that are left."""
+        """Yield the remaining frames."""
         while True:
-            there, bgr = self._capture.read()
-            if not there:
+            ok, bgr = self._capture.read()
+            if not ok:
                 return
             self.read += 1
             yield np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
     def shortfall(self) -> str | None:
-        """Return a line if the file ended before the number of frames it states, once all are read."""
-        if self.expected is None or self.read >= self.expected - 1:  # containers round, and are one off at times
+        """Once all frames are read: return a line if the file ended before the number it states."""
+        if self.expected is None or self.read >= self.expected - 1:  # containers round and may be off by one
             return None
-        return (
-            f"ends after {self.read} of {self.expected} frames, the file is cut off or damaged; what there is was kept"
-        )
+        return f"ends after {self.read} of {self.expected} frames, the file is cut off or damaged; those were kept"
 
     def close(self) -> None:
-        """Let go of the file or the camera."""
+        """Release the file or the camera."""
         self._capture.release()
 
 
 class VideoWriter:
-    """A video file that appears whole, with what was written when the block is left, by an error or not.
+    """A video file that appears when the block ends, with all frames written so far, even after an error.
 
     Args:
-        path: an ``.mp4``; its folder is made.
-        rate: frames a second.
+        path: an ``.mp4``; its folder is created.
+        rate: frames per second.
     """
 
     def __init__(self, path: Path, *, rate: float) -> None:
         self.path, self._rate = path, rate
         self._writer: cv2.VideoWriter | None = None
-        self._part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")  # OpenCV goes by the ending
+        self._part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")  # OpenCV chooses the format by the ending
 
     def __enter__(self) -> VideoWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         return self
 
     def write(self, rgb: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Add a frame; all must have the first one's size. Odd sides lose a pixel, which the codec cannot keep.
+        """Add a frame; all must have the size of the first. Odd sides lose a pixel, since the codec needs even ones.
 
         Raises:
-            DataError: if no video can be written there.
+            DataError: if the video cannot be written.
         """
         even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
         if self._writer is None:
@@ -108,7 +105,7 @@ class VideoWriter:
             code = cv2.VideoWriter.fourcc(*CODEC)
             self._writer = cv2.VideoWriter(str(self._part), code, self._rate, size)
             if not self._writer.isOpened():
-                raise DataError(f"'{self.path}': no video of {size[0]} x {size[1]} can be written there.")
+                raise DataError(f"'{self.path}': cannot write a video of {size[0]} x {size[1]} there.")
         self._writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
 
     def __exit__(
@@ -117,4 +114,4 @@ class VideoWriter:
         if self._writer is not None:
             self._writer.release()
         if self._part.exists():
-            self._part.replace(self.path)  # what was written so far is worth keeping
+            self._part.replace(self.path)  # keeps the frames so far

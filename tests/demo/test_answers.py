@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from hudepth.base.camera import Intrinsics
-from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.errors import DataError
 from hudepth.data.store import to_mm
-from hudepth.demo.answers import Answer, Limits, answer, colour_table, reduced, scaled
+from hudepth.demo.answers import Answer, Limits, answer, colour_table, reduce_depth
 from hudepth.inference.model import DepthModel
 from hudepth.viz.colour import colour_depth
 
@@ -42,12 +42,12 @@ def test_a_strangers_file_is_answered_in_a_line(tmp_path: Path, model: DepthMode
 
 
 def test_what_is_too_large_is_not_read(tmp_path: Path, model: DepthModel) -> None:
-    with pytest.raises(DataError, match=r"'a.png': 1\.5 MB, at most 1 are taken\. Resize the picture\."):
+    with pytest.raises(DataError, match=r"'a.png': 1\.5 MB"):
         answered(tmp_path, model, bytes(3 * 2**19))
 
 
 def test_a_picture_that_is_gone_is_said(tmp_path: Path, model: DepthModel) -> None:
-    with pytest.raises(DataError, match=r"'b.png': cannot be read \(No such file or directory\)\. Choose the picture"):
+    with pytest.raises(DataError, match=r"'b.png': .*No such file"):
         answer(tmp_path / "b.png", model, LIMITS)
 
 
@@ -71,7 +71,7 @@ def test_of_a_large_picture_depths_are_picked_not_averaged(tmp_path: Path, model
 
 
 def test_one_row_is_a_picture_too(tmp_path: Path, model: DepthModel) -> None:
-    assert reduced(answered(tmp_path, model, encoded(1, 2000)).depth).metres.shape == (1, 640)
+    assert reduce_depth(answered(tmp_path, model, encoded(1, 2000)).depth).metres.shape == (1, 640)
 
 
 def test_a_camera_is_scaled_with_the_picture(tmp_path: Path, model: DepthModel) -> None:
@@ -81,7 +81,7 @@ def test_a_camera_is_scaled_with_the_picture(tmp_path: Path, model: DepthModel) 
     nyu = answered(tmp_path, model, encoded(960, 1280, "JPEG")).camera
     assert nyu == Intrinsics.of_nyu(480, 640)
     assert not nyu.known
-    assert scaled(nyu, 1, 1) == nyu
+    assert nyu.scale(1, 1) == nyu
 
 
 def test_an_animation_says_that_one_frame_was_taken(tmp_path: Path, model: DepthModel) -> None:
@@ -95,9 +95,3 @@ def test_the_table_has_the_colours_of_depth_pictures() -> None:
     depth = np.array([[0.02, 2.0, 5.0, 9.98]], np.float32)
     expected = colour_depth(depth, scale_m=(0.0, 10.0), legend=False)[0]
     np.testing.assert_array_equal(colour_table()[np.rint(depth[0] * 25.5).astype(int)], expected)
-
-
-@pytest.mark.parametrize("pixels", [0, 100_000_001])
-def test_limits_are_checked(pixels: int) -> None:
-    with pytest.raises(ConfigError, match="max_pixels"):
-        Limits(upload_bytes=1, pixels=pixels)

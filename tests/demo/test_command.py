@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import socket
 from pathlib import Path
 from typing import Any
@@ -11,26 +12,24 @@ from tests.commands import Command
 
 
 @pytest.mark.parametrize(
-    ("argument", "error"),
+    ("argument", "words"),
     [
-        ("port=70000", "port: 70000 is above 65535. Leave it out for 7860, or pass 0 for any that is free."),
-        ("port=x", "port: x is no whole number of at least 0. Leave it out for 7860."),
-        ("max_upload_mb=0", "max_upload_mb: 0 is not above 0 and at most 1024. Leave it out for 20."),
-        ("max_pixels=0", "max_pixels: 0 is no whole number of at least 1. Leave it out for 40000000."),
-        ("max_pixels=200000000", "max_pixels: 200000000 is not from 1 to 100000000. Leave it out for 40000000."),
-        ("intrinsics=[1,2]", "intrinsics: [1, 2] is not [fx,fy,cx,cy]. Pass four numbers, in pixels of the images."),
-        ("intrinsics=[0,1,2,3]", "intrinsics: [0.0,1.0,2.0,3.0] is no camera."),
-        ("fit=streched", "fit: no 'streched'. Did you mean 'stretch'?"),
-        ("prot=1", "no key 'prot'. Did you mean 'port'?"),
+        ("port=70000", "port: 70000 .* 65535"),
+        ("port=x", "port: 'x' .* number"),
+        ("max_upload_mb=0", "max_upload_mb: 0 .* above 0"),
+        ("max_pixels=0", "max_pixels: 0 .* 40000000"),
+        ("max_pixels=200000000", "max_pixels: 200000000 .* 100000000"),
+        ("intrinsics=[1,2]", r"intrinsics: \[1,2\] .*fx,fy,cx,cy"),
+        ("intrinsics=[0,1,2,3]", "intrinsics: .* camera"),
+        ("fit=streched", "fit: 'streched' .* 'stretch'"),
+        ("prot=1", "'prot'.* 'port'"),
     ],
 )
-def test_mistakes_are_answered_in_a_line(command: Command, argument: str, error: str) -> None:
+def test_mistakes_are_answered_in_a_line(command: Command, argument: str, words: str) -> None:
     pytest.importorskip("gradio", reason="gradio is not installed")
-    result = command("demo", "checkpoint=model.ckpt", "port=0", argument) if "port" not in argument else command(
-        "demo", "checkpoint=model.ckpt", argument
-    )  # fmt: skip
+    result = command("demo", "checkpoint=model.ckpt", *(["port=0"] if "port" not in argument else []), argument)
     assert result.code == 1
-    assert result.err.startswith(f"hudepth-demo: {error}")
+    assert re.match(f"hudepth-demo: .*{words}", result.err)
     assert result.err.count("\n") == 1
 
 
@@ -50,7 +49,7 @@ def test_a_port_that_is_taken_is_said_before_anything_is_loaded(command: Command
         port = taken.getsockname()[1]
         result = command("demo", "checkpoint=model.ckpt", f"port={port}")
     assert result.code == 1
-    assert result.err.startswith(f"hudepth-demo: port: 127.0.0.1:{port} cannot be had (")
+    assert result.err.startswith(f"hudepth-demo: port: 127.0.0.1:{port} is not available (")
     assert "port=0" in result.err
 
 

@@ -10,17 +10,13 @@ from hudepth.base.errors import ConfigError
 from hudepth.demo.server import POLICY, Policy, free_port
 
 
-def test_a_port_that_is_taken_is_said_with_the_mend() -> None:
+def test_a_port_that_is_taken_is_an_error_with_a_fix() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigError) as caught:
+        with pytest.raises(ConfigError, match=rf"port: 127\.0\.0\.1:{port} .*in use.*port=0"):
             free_port("127.0.0.1", port)
-    assert str(caught.value) == (
-        f"port: 127.0.0.1:{port} cannot be had (Address already in use). "
-        "Pass another port=, or port=0 for any that is free."
-    )
 
 
 def test_zero_is_any_port() -> None:
@@ -28,7 +24,7 @@ def test_zero_is_any_port() -> None:
 
 
 def test_a_host_must_be_an_address_of_this_machine() -> None:
-    with pytest.raises(ConfigError, match=r"port: 192\.0\.2\.1:80 cannot be had"):  # an address that nobody has
+    with pytest.raises(ConfigError, match=r"port: 192\.0\.2\.1:80"):  # an address that nobody has
         free_port("192.0.2.1", 80)
 
 

@@ -1,16 +1,19 @@
-"""A model that needs no training: what it says of an image can be worked out by hand."""
+"""Models that need no training."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hudepth.inference.info import ModelInfo
 from hudepth.inference.model import DepthModel
+from hudepth.inference.model_info import ModelInfo
+from tests.networks import write_tiny_checkpoint
 
 
 class GreyBackend:
-    """Depth [m] is the mean of red, green and blue over 100."""
+    """Depth [m] is the mean of red, green and blue over 100, which can be checked by hand."""
 
     name = "torch"
 
@@ -26,3 +29,9 @@ class GreyBackend:
 @pytest.fixture
 def grey() -> DepthModel:
     return DepthModel(GreyBackend())
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The checkpoint of a tiny network with random weights."""
+    return write_tiny_checkpoint(tmp_path_factory.mktemp("tiny") / "tiny.ckpt")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import hudepth
-from hudepth.inference.info import ModelInfo
+from hudepth.base.errors import CheckpointError
 from hudepth.inference.model import DepthModel
+from hudepth.inference.model_info import ModelInfo
 
 
 class Columns:
@@ -32,7 +33,7 @@ def test_flipping_averages_with_the_mirrored_image_mirrored_back(grey: DepthMode
         np.testing.assert_allclose(after.metres, image.mean(-1) + 0.1 * (width - 1) / 2, rtol=1e-5)
 
 
-def test_the_model_that_comes_along_sees_depth() -> None:
+def test_the_bundled_pretrained_model_sees_depth() -> None:
     model = hudepth.load("nyu")
     assert model.info.size == (160, 160)
     floor = np.zeros((240, 320, 3), np.uint8)
@@ -40,3 +41,9 @@ def test_the_model_that_comes_along_sees_depth() -> None:
     metres = model.predict(floor).metres
     assert metres.shape == (240, 320)
     assert 0.3 < metres.min() < metres.max() < 10
+
+
+def test_a_missing_bundled_model_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hudepth.runs.bundles.find_spec", lambda _: None)
+    with pytest.raises(CheckpointError, match="checkpoint: .*'nyu'"):
+        hudepth.load("nyu")

@@ -1,20 +1,19 @@
-"""From an image of any size and shape to what the network takes, and back."""
+"""Resize an image of any size and shape to the network's input, and its depth back."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.images import resize_image
 from hudepth.base.normalise import IMAGENET_MEAN
 
-FITS = ("stretch", "letterbox")
-"""``stretch`` gives the whole image the network's size, as in training. ``letterbox`` first pads it with grey to the
-shape of the training images, so that things keep the proportions the network knows, at the price of resolution."""
+Fit = Literal["stretch", "letterbox"]
+"""``stretch`` resizes the whole image to the network's input, as in training. ``letterbox`` first pads it with grey to
+the shape of the training images: proportions stay as the network knows them, at the price of resolution."""
 
 
 class Fitted(NamedTuple):
@@ -22,31 +21,20 @@ class Fitted(NamedTuple):
 
     rgb: UInt8[np.ndarray, "h w 3"]
     box: tuple[slice, slice]
-    """Rows and columns of it that the image fills."""
+    """Rows and columns that the image fills."""
 
 
-def check_fit(fit: str) -> str:
-    """Return ``fit``.
-
-    Raises:
-        ConfigError: if there is no such way.
-    """
-    if fit not in FITS:
-        raise ConfigError(f"fit: no '{fit}'.{did_you_mean(fit, FITS)} Pass one of {', '.join(FITS)}.")
-    return fit
-
-
-def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: str, aspect: float) -> Fitted:
-    """Bring an image to the network's size.
+def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: Fit, aspect: float) -> Fitted:
+    """Resize an image to the network's input.
 
     Args:
         image: RGB.
-        size: (height, width) the network takes.
-        fit: one of :data:`FITS`.
-        aspect: width over height of the images it was trained on, before they were resized.
+        size: (height, width) of the input.
+        fit: how.
+        aspect: width over height of the training images before they were resized.
     """
     height, width = size
-    relative = image.shape[1] / image.shape[0] / aspect  # how much wider than the training images it is
+    relative = image.shape[1] / image.shape[0] / aspect  # above 1: wider than the training images
     if fit == "stretch" or relative == 1:
         return Fitted(resize_image(image, size), (slice(0, height), slice(0, width)))
     rows = max(1, round(height / max(relative, 1)))
@@ -62,7 +50,7 @@ def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: 
 def unfit_depth(
     depth_m: Float[np.ndarray, "h w"], box: tuple[slice, slice], size: tuple[int, int]
 ) -> Float[np.ndarray, "H W"]:
-    """Bring the depth of a fitted image to the image's own size, bilinearly.
+    """Resize the depth of a fitted image to the image's own (height, width), bilinearly.
 
     Args:
         depth_m: at the network's size [m].

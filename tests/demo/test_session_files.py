@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from hudepth.demo.answers import Limits, answer
-from hudepth.demo.files import DOWNLOADS, EXAMPLE_ROOMS, Files, draw_examples
+from hudepth.demo.session_files import DOWNLOADS, EXAMPLE_ROOMS, Files, draw_examples
 from hudepth.inference.model import DepthModel
 
 from .conftest import encoded

@@ -1,4 +1,4 @@
-"""What a page keeps on disk while it runs: one temporary folder, and in it each session's last picture alone."""
+"""What the page keeps on disk while it runs: a temporary folder with the last picture of each session."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-import cv2
 import numpy as np
 
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.demo.answers import Answer
-from hudepth.inference.writing import FORMATS, Style
+from hudepth.inference.depth_files import FORMATS, Style, jpeg
 
 EXAMPLE_ROOMS = (3, 1, 2, 0)
-"""Scenes of the built-in rooms: a living room, a kitchen, an office, a bedroom."""
+"""Scenes of the synthetic rooms: a living room, a kitchen, an office, a bedroom."""
 EXAMPLE_SIZE = (480, 640)
 DOWNLOADS = ("png16", "npy", "ply")
 """Formats that can be downloaded, in the order of the buttons."""
@@ -31,7 +30,7 @@ class _Session:
 
 
 class Files:
-    """The folder of a running page, gone with it; used as ``with Files() as files``."""
+    """The folder of a running page, deleted when it ends; used as ``with Files() as files``."""
 
     def __init__(self) -> None:
         self._sessions: dict[str, _Session] = {}
@@ -50,12 +49,12 @@ class Files:
         shutil.rmtree(self.root, ignore_errors=True)
 
     def begin(self, session: str, upload: Path) -> None:
-        """Note what a session uploaded, and delete what it had before."""
-        uploaded = upload if upload.is_relative_to(self.uploads) else None  # an example stays
+        """Record what a session uploaded, and delete its previous files."""
+        uploaded = upload if upload.is_relative_to(self.uploads) else None  # examples are kept
         self._replace(session, _Session(uploaded))
 
     def end(self, session: str) -> None:
-        """Delete all that belongs to a session and to no other."""
+        """Delete everything that belongs to this session only."""
         self._replace(session, None)
 
     def _replace(self, session: str, now: _Session | None) -> None:
@@ -63,19 +62,21 @@ class Files:
             before = self._sessions.pop(session, _Session())
             if now is not None:
                 self._sessions[session] = now
-            kept = {each.upload for each in self._sessions.values()}  # a picture that was uploaded twice is one file
+            kept = {
+                each.upload for each in self._sessions.values()
+            }  # gradio stores a picture uploaded twice as one file
             if before.upload is not None and before.upload not in kept:
                 before.upload.unlink(missing_ok=True)
         if before.results is not None:
             shutil.rmtree(before.results, ignore_errors=True)
 
     def write(self, session: str, answer: Answer) -> list[Path]:
-        """Write a session's downloads, in the order of :data:`DOWNLOADS`, into a folder whose name nobody can guess.
+        """Write a session's downloads, in the order of :data:`DOWNLOADS`, into a folder with an unguessable name.
 
-        PNG and npy have the picture's own size; the point cloud has the points that are shown.
+        PNG and npy have the size of the picture; the point cloud has the points that are shown.
 
         Raises:
-            OSError: whatever the file system says.
+            OSError: if a file cannot be written.
         """
         folder = self.results / secrets.token_urlsafe(16)
         folder.mkdir()
@@ -92,16 +93,11 @@ class Files:
 
 
 def draw_examples(folder: Path) -> list[Path]:
-    """Draw pictures of built-in rooms, a quarter of a second each.
-
-    Args:
-        folder: where to.
-    """
+    """Render pictures of synthetic rooms into a folder, a quarter of a second each."""
     rooms = RoomsSource(scenes=max(EXAMPLE_ROOMS) + 2, frames_per_scene=1, size=EXAMPLE_SIZE)
     records = rooms.records()
     paths = []
     for scene in EXAMPLE_ROOMS:
         paths.append(folder / f"{records[scene].category}.jpg")
-        bgr = cv2.cvtColor(np.asarray(rooms.read(records[scene]).image, np.uint8), cv2.COLOR_RGB2BGR)
-        paths[-1].write_bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+        paths[-1].write_bytes(jpeg(np.asarray(rooms.read(records[scene]).image, np.uint8), quality=95))
     return paths

@@ -1,0 +1,63 @@
+"""The file formats of a predicted depth map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from hudepth.base.camera import Intrinsics
+from hudepth.base.files import written_whole
+from hudepth.inference.depth_map import DepthMap
+
+
+@dataclass(frozen=True)
+class Style:
+    """What all pictures and point clouds of a run have in common."""
+
+    scale_m: tuple[float, float]
+    """Ends of the colour scale [m]."""
+    intrinsics: Intrinsics | None = None
+    """Of the camera, in pixels of the images; None: NYU's, scaled to each."""
+
+
+Write = Callable[[DepthMap, IO[bytes], Style], object]
+
+FORMATS: dict[str, tuple[str, Write]] = {
+    "png16": ("_depth.png", lambda depth, file, _: file.write(depth.to_png16())),
+    "npy": ("_depth.npy", lambda depth, file, _: np.save(file, depth.metres)),
+    "colour": ("_depth.jpg", lambda depth, file, style: file.write(jpeg(depth.colourise(scale_m=style.scale_m)))),
+    "side": ("_side.jpg", lambda depth, file, style: file.write(jpeg(depth.side_by_side(scale_m=style.scale_m)))),
+    "ply": ("_depth.ply", lambda depth, file, style: file.write(depth.point_cloud(style.intrinsics).to_ply())),
+}
+"""By name: the ending of the file's name, and what writes it. ``png16`` is in millimetres, ``npy`` and ``ply`` are in
+metres, ``colour`` and ``side`` are pictures with a scale."""
+
+
+def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Style) -> None:
+    """Write ``<stem>_depth.png`` and so on, each whole or not at all.
+
+    Args:
+        stem: path without an ending.
+        depth: what to write.
+        formats: names in :data:`FORMATS`.
+        style: of pictures and clouds.
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    for name in formats:
+        ending, write = FORMATS[name]
+        with written_whole(stem.with_name(stem.name + ending), durable=False) as part, part.open("wb") as file:
+            write(depth, file, style)
+
+
+def jpeg(rgb: UInt8[np.ndarray, "h w 3"], *, quality: int = 92) -> bytes:
+    """Return a picture as a JPEG file."""
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -1,0 +1,104 @@
+"""The description that every model file carries: all that is needed to use it, and what it was trained on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from hudepth.base.errors import CheckpointError
+from hudepth.runs.checkpoint import Checkpoint
+
+VERSION = 1
+"""Of the description; exported files carry it as JSON under the key :data:`KEY`."""
+KEY = "hudepth"
+USUAL_ASPECT = 4 / 3
+"""Width over height of training images if a checkpoint does not record it: that of NYU Depth V2 and most sensors."""
+MAX_SIDE = 8192
+"""Descriptions that ask for larger images are refused."""
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What is known about a model."""
+
+    name: str
+    """Class of the network, for example ``HybridUNet``."""
+    size: tuple[int, int]
+    """(height, width) of the images the network takes."""
+    max_depth_m: float
+    """Maximum depth [m]; the network predicts depth / max_depth_m."""
+    parameters: int
+    epoch: int
+    """Finished epochs of training."""
+    trained_on: dict[str, Any] = field(default_factory=dict)
+    """Source, fingerprint, encoding and split of the training data."""
+    aspect: float = USUAL_ASPECT
+    """Width over height of the training images before they were resized."""
+    processing: bool = True
+    """Whether an exported graph maps RGB bytes to metres; otherwise normalised images to unit depth."""
+
+    def to_json(self) -> str:
+        """Return the description as JSON."""
+        return json.dumps({"version": VERSION, **asdict(self)}, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str, *, where: str) -> ModelInfo:
+        """Read what :meth:`to_json` wrote; values out of range are rejected.
+
+        Raises:
+            CheckpointError: if it is not such a description.
+        """
+        try:
+            content = json.loads(text)
+            if not isinstance(content, Mapping) or content.get("version") != VERSION:
+                raise ValueError("unknown version")
+            height, width = (int(side) for side in content["size"])
+            depth, aspect = float(content["max_depth_m"]), float(content["aspect"])
+            if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and 0 < depth < 1e6 and 0.01 < aspect < 100):
+                raise ValueError("values out of range")
+            return cls(
+                name=str(content["name"])[:100],
+                size=(height, width),
+                max_depth_m=depth,
+                parameters=int(content["parameters"]),
+                epoch=int(content["epoch"]),
+                trained_on=dict(content["trained_on"]),
+                aspect=aspect,
+                processing=bool(content["processing"]),
+            )
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            raise CheckpointError(
+                f"{where}: its model description cannot be read ({error}). Export it again with hudepth-export."
+            ) from error
+
+    @classmethod
+    def of_checkpoint(
+        cls, checkpoint: Checkpoint, *, parameters: int, size: tuple[int, int] | None = None
+    ) -> ModelInfo:
+        """Describe a checkpoint.
+
+        Args:
+            checkpoint: what to describe.
+            parameters: of its network.
+            size: (height, width) of its input; default: that of its training.
+
+        Raises:
+            CheckpointError: if it does not record its training data.
+        """
+        data: Any = checkpoint.config.get("data")
+        try:
+            height, width = size or data["size"]
+            native = checkpoint.data.get("native_sizes") or []
+            return cls(
+                name=str(checkpoint.config["model"].get("_target_", "")).rpartition(".")[2],
+                size=(int(height), int(width)),
+                max_depth_m=float(data["max_depth_m"]),
+                parameters=parameters,
+                epoch=checkpoint.epoch,
+                trained_on={**checkpoint.data, "split": checkpoint.split},
+                aspect=native[0][1] / native[0][0] if len(native) == 1 else USUAL_ASPECT,
+            )
+        except (TypeError, KeyError, ValueError, IndexError, ZeroDivisionError) as error:
+            raise CheckpointError(f"'{checkpoint.path}' does not record what data it was trained on.") from error
