@@ -128,7 +128,8 @@ def export(cfg: DictConfig) -> None:
     torch.set_num_threads(usable_cores())
     reference = TorchBackend(net, info, device=torch.device("cpu"))
     images = find_images(
-        checkpoint, folder=options.images, size=info.size, compared=options.compared, calibration=options.calibration,
+        checkpoint, folder=options.images, size=info.size, compared=options.compared,
+        calibration=options.calibration if "int8" in options.format else 1,  # only int8 needs them
         data={"cache": options.cache, **options.data}, trust=options.trust,
     )  # fmt: skip
     output = output_folder(options.output)

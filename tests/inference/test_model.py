@@ -45,5 +45,5 @@ def test_the_bundled_pretrained_model_sees_depth() -> None:
 
 def test_a_missing_bundled_model_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hudepth.runs.bundles.find_spec", lambda _: None)
-    with pytest.raises(CheckpointError, match="checkpoint: .*'nyu'"):
+    with pytest.raises(CheckpointError, match=r"checkpoint: .*'nyu'"):
         hudepth.load("nyu")
