@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,10 +12,9 @@ from typing import Any
 from hudepth.base.errors import ConfigError, HudepthError
 from hudepth.runs.history import read_history
 from hudepth.runs.identity import INCIDENTAL, flat
-from hudepth.runs.results import MODEL
+from hudepth.runs.results import MODEL, read_metrics
 from hudepth.runs.run import is_run, read_config
 
-"""What metrics.json calls the trained network, beside the baselines."""
 NOT_RECIPE = (
     *INCIDENTAL, "monitor", "mode", "callbacks", "data.native", "data.on_error", "trainer.deterministic",
     "trainer.max_epochs", "model.weights",
@@ -142,32 +140,12 @@ def read_run(path: Path) -> Run:
     tests: dict[str, dict[str, Any]] = {}
     for file in sorted((path / "test").glob("*/metrics.json")):
         try:
-            tests[file.parent.name] = read_result(file)
-        except ConfigError as error:
+            tests[file.parent.name] = read_metrics(file)
+        except HudepthError as error:
             problems.append(str(error))
     if not tests:
         problems.append(f"'{path}' holds no readable test result. Run hudepth-test checkpoint={path} first.")
     return Run(path, config, history, tests, problems)
-
-
-def read_result(file: Path) -> dict[str, Any]:
-    """Read a metrics.json.
-
-    Raises:
-        ConfigError: if it cannot be read or holds no metrics of the trained network.
-    """
-    again = "Run hudepth-test on that run again."
-    try:
-        result: Any = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"'{file}' cannot be read ({type(error).__name__}). {again}") from error
-    metrics = result.get("metrics") if isinstance(result, dict) else None
-    if not isinstance(metrics, dict) or not isinstance(metrics.get(MODEL), dict):
-        raise ConfigError(f"'{file}' holds no metrics of a model. {again}")
-    for key in ("data", "split", "protocol", "intervals", "checkpoint"):
-        if not isinstance(result.get(key, {}), dict):
-            raise ConfigError(f"'{file}': its '{key}' is no mapping. {again}")
-    return dict(result)
 
 
 def same_but(a: Run, b: Run, *keys: str) -> bool:

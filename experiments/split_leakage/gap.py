@@ -18,7 +18,8 @@ from pathlib import Path
 from hudepth.base.files import write_between, write_json
 from hudepth.metrics.bootstrap import describe, intervals, paired_differences, unpaired_differences
 from hudepth.metrics.summary import summarise
-from hudepth.runs.results import Result, common_images, find_result
+from hudepth.runs.comparison import common_images
+from hudepth.runs.results import Result, find_result
 
 METRICS = ("abs_rel", "rmse", "delta1", "ssim")
 HERE = Path(__file__).parent

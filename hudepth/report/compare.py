@@ -20,7 +20,8 @@ from hudepth.metrics.bootstrap import LEVEL, REPEATS, SEED, Difference, describe
 from hudepth.metrics.catalogue import metric_info
 from hudepth.metrics.summary import ImageTable
 from hudepth.report.scatter import draw_comparison
-from hudepth.runs.results import Result, find_result, paired
+from hudepth.runs.comparison import paired
+from hudepth.runs.results import Result, find_result
 from hudepth.runs.run import CHECKPOINTS
 from hudepth.viz.panels import save_figure, save_panels
 

@@ -15,7 +15,8 @@ from hudepth.base.options import output_folder
 from hudepth.base.tables import Table, stdout
 from hudepth.metrics.bootstrap import intervals
 from hudepth.metrics.catalogue import metric_info, metric_names
-from hudepth.runs.results import Result, find_result, merge
+from hudepth.runs.comparison import merge
+from hudepth.runs.results import Result, find_result
 from hudepth.runs.run import CHECKPOINTS
 
 WIDE, LOG_WIDTH = 190, 200

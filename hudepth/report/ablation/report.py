@@ -17,7 +17,8 @@ from hudepth.report.ablation.cautions import other_versions, undefined, unpaired
 from hudepth.report.ablation.estimates import contrast, estimate
 from hudepth.report.ablation.factors import Factor
 from hudepth.report.ablation.rows import Row, Rows, Trouble, choose_reference
-from hudepth.runs.results import Result, paired, stamp_differences
+from hudepth.runs.comparison import paired, stamp_differences
+from hudepth.runs.results import Result
 
 
 @dataclass(frozen=True)

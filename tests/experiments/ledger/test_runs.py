@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.ledger.runs import find_runs, flat, pairs, read_result, read_run, same_but
+from experiments.ledger.runs import find_runs, flat, pairs, read_run, same_but
 from hudepth.base.errors import ConfigError
 
 MakeRun = Callable[..., Path]
@@ -57,9 +57,7 @@ def test_what_is_missing_or_damaged_is_said_and_the_rest_kept(make_run: MakeRun)
     assert list(run.tests) == ["eigen"]
     assert len(run.problems) == 2
     assert run.problems[0].startswith(f"'{path}/metrics.csv' cannot be read as a history of epochs")
-    assert run.problems[1] == (
-        f"'{path}/test/paper/metrics.json' cannot be read (JSONDecodeError). Run hudepth-test on that run again."
-    )
+    assert run.problems[1].startswith(f"'{path}/test/paper/metrics.json' cannot be read (")
 
 
 def test_a_run_without_results_says_what_to_run(make_run: MakeRun) -> None:
@@ -76,23 +74,6 @@ def test_a_damaged_configuration_matches_nothing(make_run: MakeRun) -> None:
     run = read_run(a)
     assert run.problems[0].startswith(f"'{a}' is not a run directory: its config.yaml")
     assert not same_but(run, read_run(b))
-
-
-@pytest.mark.parametrize("content", [[], {"metrics": 1}, {"metrics": {"mean_depth": {}}}])
-def test_results_without_a_model_are_refused(tmp_path: Path, content: object) -> None:
-    file = tmp_path / "metrics.json"
-    file.write_text(json.dumps(content))
-    with pytest.raises(ConfigError) as error:
-        read_result(file)
-    assert str(error.value) == f"'{file}' holds no metrics of a model. Run hudepth-test on that run again."
-
-
-def test_results_of_another_shape_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "metrics.json"
-    file.write_text(json.dumps({"metrics": {"model": {}}, "split": "random"}))
-    with pytest.raises(ConfigError) as error:
-        read_result(file)
-    assert str(error.value) == f"'{file}': its 'split' is no mapping. Run hudepth-test on that run again."
 
 
 @pytest.mark.parametrize("value", ["0.2", True, None, float("nan")])
@@ -140,10 +121,3 @@ def test_parts_of_another_shape_count_as_missing(make_run: MakeRun, damage: dict
     run = read_run(path)
     assert run.training_images is run.interval("eigen", "abs_rel") is None
     assert run.metric("eigen", "abs_rel") == 0.2
-
-
-def test_brackets_without_end_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "metrics.json"
-    file.write_text("[" * 100_000)
-    with pytest.raises(ConfigError, match=r"cannot be read \(RecursionError\)\. Run hudepth-test on that run again\."):
-        read_result(file)

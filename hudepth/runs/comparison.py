@@ -1,0 +1,185 @@
+"""Which test results may be compared, and what they have in common.
+
+A number is meaningful only with its protocol, data and split. Results are put side by side where these agree, or
+together with what differs.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from hudepth.base.errors import DataError, did_you_mean
+from hudepth.metrics.summary import ImageTable
+from hudepth.runs.identity import flat
+from hudepth.runs.results import Result
+
+
+def stamp_differences(a: Result, b: Result) -> list[str]:
+    """Return what prevents comparing two results, for example ``protocol.crop: [45,471,41,601] against none``.
+
+    Compared are all values of the protocol; source, fingerprint and encoding of the data; kind and sha256 of the
+    split; and, for protocols that score at network resolution, size and maximum depth, which define the ground truth.
+    """
+    before, after = _conditions(a), _conditions(b)
+    return [
+        f"{key}: {_format(before.get(key))} against {_format(after.get(key))}"
+        for key in dict.fromkeys([*before, *after])
+        if before.get(key) != after.get(key)
+    ]
+
+
+def _conditions(result: Result) -> dict[str, Any]:
+    conditions = flat(result.stamp, "protocol.")
+    if result.stamp.get("resolution") == "network":
+        conditions |= {key: result.document.get(key) for key in ("network_size", "max_depth_m")}
+    conditions |= {f"data.{key}": result.data.get(key) for key in ("source", "fingerprint", "encoding")}
+    return conditions | {f"split.{key}": result.split.get(key) for key in ("kind", "sha256")}
+
+
+def _format(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, str):
+        return value[:8] if len(value) == 64 else value  # a sha256
+    return json.dumps(value, separators=(",", ":"))
+
+
+def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
+    """Return the images of two results, in the order of the first.
+
+    The splits may differ in their training pairs, as long as the test images are the same.
+
+    Raises:
+        DataError: if protocol, data or images differ; the message suggests a fix.
+    """
+    where = _check_conditions(a, b)
+    first, second = _take_common(a.table, b.table)
+    count, others, shared = len(a.table.ids), len(b.table.ids), len(first.ids)
+    if not count == others == shared:
+        raise DataError(
+            f"{where} were tested on different images: {count} of split {a.split['kind']} and {others} of split "
+            f"{b.split['kind']}, {shared} of them in both. Compare runs of one data.split, or test both on data that "
+            "neither was trained on: hudepth-test checkpoint=<run> data=<name>."
+        )
+    if first.scenes != second.scenes or not np.array_equal(first.pixels, second.pixels):
+        raise DataError(
+            f"{where} have different scenes or pixel counts for the same images. Run hudepth-test on both again."
+        )
+    return a.table, second
+
+
+def common_images(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
+    """Return the images that are in both results, in the order of the first; for two splits of one data set.
+
+    Raises:
+        DataError: if protocol or data differ, or if they share no image.
+    """
+    where = _check_conditions(a, b)
+    tables = _take_common(a.table, b.table)
+    if not tables[0].ids:
+        raise DataError(f"{where} share no test image. Compare splits of one data set.")
+    return tables
+
+
+def _check_conditions(a: Result, b: Result) -> str:
+    """Refuse different data or protocols; return both paths, for messages."""
+    where = f"'{a.path}' and '{b.path}'"
+    lines = [line for line in stamp_differences(a, b) if not line.startswith("split.")]
+    if data := [line for line in lines if line.startswith("data.")]:
+        raise DataError(
+            f"{where} were tested on different data ({'; '.join(data)}), so their images cannot be paired. "
+            "Test both on one data set: hudepth-test checkpoint=<run> data=<name>."
+        )
+    if lines:
+        raise DataError(
+            f"{where} were tested under different protocols ({_first(lines)}). "
+            "Run hudepth-test on both again with the same settings."
+        )
+    return where
+
+
+def _take_common(a: ImageTable, b: ImageTable) -> tuple[ImageTable, ImageTable]:
+    position = {image: row for row, image in enumerate(b.ids)}
+    rows = [row for row, image in enumerate(a.ids) if image in position]
+    return _take(a, rows), _take(b, [position[a.ids[row]] for row in rows])
+
+
+def _take(table: ImageTable, rows: Sequence[int]) -> ImageTable:
+    return replace(
+        table,
+        ids=[table.ids[row] for row in rows],
+        scenes=[table.scenes[row] for row in rows],
+        categories=[table.categories[row] for row in rows],
+        pixels=table.pixels[list(rows)],
+        values={name: values[list(rows)] for name, values in table.values.items()},
+    )
+
+
+def merge(results: Mapping[str, Result], *, metrics: Sequence[str], mark: bool = False) -> list[dict[str, str | float]]:
+    """Return the rows of a table, one per result: ``name``, then the metrics of its network.
+
+    Args:
+        results: by the name of their row.
+        metrics: columns; NaN where a result lacks one.
+        mark: where protocols, data or splits differ, add the columns ``protocol``, ``data`` and ``split`` as needed
+            to tell the rows apart, instead of raising.
+
+    Raises:
+        DataError: if they differ and ``mark`` is not set, or if no result has a metric.
+    """
+    known = {name for result in results.values() for name in result.metrics}
+    for name in metrics:
+        if name not in known:
+            raise DataError(f"no result has a metric '{name}'.{did_you_mean(name, known)}")
+    marks = _marks(results)
+    if marks and not mark:
+        (name, first), *others = results.items()
+        other, lines = next((n, lines) for n, r in others if (lines := stamp_differences(first, r)))
+        raise DataError(
+            f"the results of '{name}' and '{other}' do not compare: {_first(lines)}. "
+            "Run hudepth-test on them again with the same settings, or mark in the table what differs."
+        )
+    return [
+        {
+            "name": name,
+            **{column: words[name] for column, words in marks.items()},
+            **{metric: result.metrics.get(metric, math.nan) for metric in metrics},
+        }
+        for name, result in results.items()
+    ]
+
+
+def _marks(results: Mapping[str, Result]) -> dict[str, dict[str, str]]:
+    """Return which of protocol, data and split differ, and a text for each result that tells it apart."""
+    conditions = {name: _conditions(result) for name, result in results.items()}
+    pairs = list(combinations(conditions.values(), 2))
+    marks = {}
+    for column, main in (("protocol", "protocol.name"), ("data", "data.source"), ("split", "split.kind")):
+        keys = dict.fromkeys(key for each in conditions.values() for key in each if _column(key) == column)
+        # what differs between results of the same name is added to the name
+        more = [k for k in keys if any(x[main] == y[main] and x.get(k) != y.get(k) for x, y in pairs)]
+        if more or any(x[main] != y[main] for x, y in pairs):
+            marks[column] = {
+                name: ", ".join(
+                    [str(x[main]), *(f"{k.partition('.')[2] or k} {_format(x[k])}" for k in more if k in x)]
+                )
+                for name, x in conditions.items()
+            }
+    return marks
+
+
+def _column(key: str) -> str:
+    part = key.partition(".")[0]
+    return part if part in ("data", "split") else "protocol"
+
+
+def _first(lines: Sequence[str]) -> str:
+    more = f"; {len(lines) - 3} more" if len(lines) > 3 else ""
+    return "; ".join(lines[:3]) + more
