@@ -28,9 +28,9 @@ def table_csv(report: Report) -> str:
     numbers = [f"{name}{part}" for name in report.metrics for part in PARTS]
     table = Table(["row", *factors, *OWN[1:], *numbers])
     for row in report.rows:
-        counts = (str(row.is_reference).lower(), str(len(row.runs)), str(len(row.variant.seeds)))
+        counts = (str(row.is_reference).lower(), str(len(row.runs)), str(len(row.seeds)))
         cells = (cell for name in report.metrics for cell in _cells(row, name))
-        table.add(row.label, *row.variant.factors, *counts, "; ".join(row.differs), *cells)
+        table.add(row.label, *row.factors, *counts, "; ".join(row.differs), *cells)
     return table.to_csv()
 
 
@@ -71,34 +71,32 @@ def document(report: Report, sweep: Sweep) -> dict[str, Any]:
 
 
 def _row(row: Row, report: Report) -> dict[str, Any]:
-    changes = config_differences(report.reference.variant.config, row.variant.config)
+    changes = config_differences(report.reference.config, row.config)
     return {
         "label": row.label,
-        "variant": row.variant.named or None,
-        "factors": dict(zip((factor.name for factor in report.factors), row.variant.factors, strict=True)),
+        "variant": row.named or None,
+        "factors": dict(zip((factor.name for factor in report.factors), row.factors, strict=True)),
         "config_differences": {key: {"reference": before, "here": after} for key, before, after in changes},
-        "seeds_tried": row.variant.seeds,
+        "seeds_tried": row.seeds,
         "runs": {seed: str(each.run.path) for seed, each in row.runs.items()},
         "differs": row.differs,
-        "metrics": {name: _estimate(each, name in row.best) for name, each in row.estimates.items()},
-        "differences": {name: _contrast(each) for name, each in row.contrasts.items()},
+        "metrics": {
+            name: _rename(each, values="by_seed") | {"best": name in row.best} for name, each in row.estimates.items()
+        },
+        "differences": {name: _rename(each, paired="paired_seeds") for name, each in row.contrasts.items()},
     }
 
 
-def _estimate(found: Estimate, best: bool) -> dict[str, Any]:
-    by_seed = {seed: _finite(value) for seed, value in found.values.items()}
-    ends = {"seeds": _ends(found.seeds), "scenes": _ends(found.scenes)}
-    return {"mean": _finite(found.mean), "by_seed": by_seed, **ends, "best": best}
+def _rename(found: Estimate | Contrast, **names: str) -> dict[str, Any]:
+    return {names.get(key, key): _plain(value) for key, value in vars(found).items()}
 
 
-def _contrast(found: Contrast) -> dict[str, Any]:
-    ends = {"seeds": _ends(found.seeds), "scenes": _ends(found.scenes)}
-    return {"value": _finite(found.value), **ends, "paired_seeds": found.paired, "verdict": found.verdict}
-
-
-def _ends(interval: Interval) -> list[float | None] | None:
-    return [_finite(interval.low), _finite(interval.high)] if interval.known else None
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+def _plain(value: Any) -> Any:
+    """Return numbers that are not finite, and intervals that there are not, as null."""
+    if isinstance(value, Interval):
+        return [_plain(value.low), _plain(value.high)] if value.known else None
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value

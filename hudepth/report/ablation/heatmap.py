@@ -46,12 +46,12 @@ def find_grid(rows: Sequence[Row]) -> Grid | None:
     """
     groups: dict[tuple[tuple[str, str], ...], list[Row]] = {}
     for row in rows:
-        config = row.variant.config
+        config = row.config
         if row.runs and all(key in config for key in WEIGHTS):
             rest = tuple((key, canonical(value)) for key, value in sorted(config.items()) if key not in WEIGHTS)
             groups.setdefault(rest, []).append(row)
     group = max(groups.values(), key=len, default=[])
-    values = {key: _sort_values([row.variant.config[key] for row in group]) for key in WEIGHTS}
+    values = {key: _sort_values([row.config[key] for row in group]) for key in WEIGHTS}
     varied = [key for key in WEIGHTS if len(values[key]) > 1]
     if len(varied) < 2:
         return None
@@ -59,7 +59,7 @@ def find_grid(rows: Sequence[Row]) -> Grid | None:
     panel = more[0] if more else ""
     cells = {}
     for row in group:
-        places = [format_value(row.variant.config[key]) if key else "" for key in (panel, y, x)]
+        places = [format_value(row.config[key]) if key else "" for key in (panel, y, x)]
         cells[places[0], places[1], places[2]] = row
     down, across, between = (key.rpartition(".")[2] for key in (y, x, panel))
     return Grid(down, across, between, values[y], values[x], values[panel] if panel else [""], cells)

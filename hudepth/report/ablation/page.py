@@ -56,15 +56,14 @@ def page(
         facts: further ones for the top of the page, like its date.
     """
     parts = [
-        ("results", "Results", _results(report)),
         ("differences", f"Differences from {report.reference.label}", _differences(report)),
         ("pictures", "Pictures", _join(map(_figure, pictures))),
         ("not-counted", "Not counted", _troubles(report)),
-        ("notes", "Notes", tag("ul", _items(notes), class_="plain") if notes else Html()),
+        ("notes", "Notes", _list(notes, class_="plain") if notes else Html()),
         ("configurations", "Configurations", _configurations(report)),
     ]
     parts = [part for part in parts if part[2]]
-    notice = tag("div", tag("ul", _items(report.warnings)), class_="notice", role="note")
+    notice = tag("div", _list(report.warnings), class_="notice", role="note")
     template = files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     return _Page(template).substitute(
         policy=_policy(template),
@@ -72,6 +71,7 @@ def page(
         about=escape(_sentence(words.about(report))),
         facts=_facts(report, facts or {}),
         warnings=notice if report.warnings else "",
+        results=_results(report),
         links=_join(tag("a", name, href=f"#{key}") for key, name, _ in parts),
         sections=_join(tag("section", tag("h2", name), inside, id=key) for key, name, inside in parts),
         method=escape(words.method(report)),
@@ -95,8 +95,8 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _items(lines: Iterable[str]) -> Html:
-    return _join(tag("li", _sentence(line)) for line in lines)
+def _list(lines: Iterable[str], *, class_: str | None = None) -> Html:
+    return tag("ul", *(tag("li", _sentence(line)) for line in lines), class_=class_)
 
 
 def _facts(report: Report, more: Mapping[str, str]) -> Html:
@@ -113,47 +113,38 @@ def _facts(report: Report, more: Mapping[str, str]) -> Html:
 
 
 def _results(report: Report) -> Html:
-    tools = Html(
-        '<div class="tools"><label for="filter">Filter rows</label>'
-        '<input id="filter" type="search" autocomplete="off" placeholder="name or value">'
-        '<output id="filtered" for="filter" class="quiet" aria-live="polite"></output></div>'
-    )
-    named = any(row.variant.named for row in report.rows)
-    factors = report.factors if named else []
     digits = words.places(report)
+    factors = report.factors if any(row.named for row in report.rows) else []  # else they are the row's name
+    numbers = [_are_numbers(factor.shown) for factor in factors]
     heads = [
         _sorter("row", is_number=False),
-        *(_sorter(factor.name, is_number=_are_numbers(factor.shown)) for factor in factors),
+        *(_sorter(factor.name, is_number=each) for factor, each in zip(factors, numbers, strict=True)),
         _sorter("seeds"),
         *(_sorter(words.heading(name)) for name in report.metrics),
     ]
     rows = []
     for row in report.rows:
-        cells = [
-            _factor(value, is_number=_are_numbers(factor.shown))
-            for factor, value in zip(factors, row.variant.factors if named else (), strict=True)
-        ]
+        cells = [_factor(value, is_number=each) for value, each in zip(row.factors, numbers, strict=False)]
         cells.append(tag("td", row.counted, data_value=str(len(row.runs))))
         rows.append(_row(row, [*cells, *(_result(row, name, digits[name]) for name in report.metrics)]))
-    note = (
-        "Mean over seeds; ± half of the 95 % interval over seeds; below it the 95 % interval over scenes. The best of "
-        "each column is underlined. Click a heading to sort."
-    )
-    return _join([tools, _table("Results", heads, rows, class_="sortable"), tag("p", note, class_="quiet")])
+    return _table("Results", heads, rows, class_="sortable")
 
 
 def _differences(report: Report) -> Html:
-    rows = [row for row in report.rows if row.contrasts]
-    if not rows:
-        return Html()
     digits = words.places(report)
     heads = [_sorter("row", is_number=False), *(_sorter(words.heading(name)) for name in report.metrics)]
-    body = [_row(row, [_difference(row, name, digits[name]) for name in report.metrics]) for row in rows]
+    rows = [
+        _row(row, [_difference(row, name, digits[name]) for name in report.metrics])
+        for row in report.rows
+        if row.contrasts
+    ]
     note = (
         "Row minus reference, paired by seed and by image; below it the 95 % intervals over seeds and over scenes. "
         "Better or worse: both exclude 0. Among many rows some differ by chance."
     )
-    return _join([_table("Differences", heads, body, class_="sortable"), tag("p", note, class_="quiet")])
+    return _join(
+        [_table("Differences", heads, rows, class_="sortable"), tag("p", note, class_="quiet")] if rows else []
+    )
 
 
 def _are_numbers(shown: Sequence[str]) -> bool:
@@ -178,7 +169,7 @@ def _row(row: Row, cells: Sequence[str]) -> Html:
     reference = [Html(" "), tag("span", "reference", class_="tag")] if row.is_reference else []
     differs = [tag("small", f"differs: {'; '.join(row.differs)}", class_="caution")] if row.differs else []
     head = tag("th", label, *reference, *differs, scope="row", data_value=row.label)
-    return tag("tr", head, *cells, data_filter=" ".join([row.label, *row.variant.factors]).lower())
+    return tag("tr", head, *cells, data_filter=" ".join([row.label, *row.factors]).lower())
 
 
 def _factor(value: str, *, is_number: bool) -> Html:
@@ -227,7 +218,7 @@ def _troubles(report: Report) -> Html:
             "tr",
             tag("th", each.run or "-", scope="row"),
             *(tag("td", text, class_="text") for text in (each.row, each.seed, each.state)),
-            tag("td", each.why or "-", class_="text long"),
+            _long(each.why or "-"),
         )
         for each in report.troubles
     ]
@@ -239,9 +230,9 @@ def _configurations(report: Report) -> Html:
     for row in report.rows:
         if row is report.reference:
             continue
-        changes = config_differences(report.reference.variant.config, row.variant.config)
+        changes = config_differences(report.reference.config, row.config)
         lines = [
-            tag("tr", tag("th", tag("code", key), scope="row"), *(_long(value) for value in values))
+            tag("tr", tag("th", tag("code", key), scope="row"), *(_long(tag("code", value)) for value in values))
             for key, *values in changes
         ]
         count = f"{len(changes)} key{'s' * (len(changes) != 1)} differ{'s' * (len(changes) == 1)}"
@@ -252,4 +243,4 @@ def _configurations(report: Report) -> Html:
 
 
 def _long(value: str) -> Html:
-    return tag("td", tag("code", value), class_="text long")
+    return tag("td", value, class_="text long")

@@ -135,7 +135,7 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
         log.info("no panels.png: no run has its checkpoint and was tested on the data it was trained on")
         return None
     from hudepth.evaluation.pictures import evenly_spaced, panels_beside  # imports torch and lightning
-    from hudepth.report.ablation.sheet import draw_sheet
+    from hudepth.viz.sheet import draw_sheet
 
     ids = sorted(report.first.table.ids)
     images = [ids[place] for place in evenly_spaced(range(len(ids)), count)]

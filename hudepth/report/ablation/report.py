@@ -56,7 +56,7 @@ def make_report(
         ConfigError: if there is no such row.
         DataError: if no run has a result.
     """
-    table = [Row(each) for each in rows.variants]
+    table = rows.rows
     warnings: list[str] = []
     chosen = choose_reference(table, reference, protocol=protocol)
     chosen.is_reference = True

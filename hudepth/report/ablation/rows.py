@@ -44,27 +44,20 @@ class Repetition:
 
 
 @dataclass
-class Variant:
-    """The runs of one configuration."""
+class Row:
+    """A row of the table: the runs of one configuration, and their metrics."""
 
     config: dict[str, Any]
     """By dotted key, without seeds; see :func:`hudepth.report.ablation.factors.variant`."""
     named: str
     """The label ``variant``; empty if there is none."""
+    seeds: list[str]
+    """All that were tried, lowest first."""
     label: str = ""
     factors: list[str] = field(default_factory=list)
     """A formatted value for each factor of the table."""
     runs: dict[str, Repetition] = field(default_factory=dict)
     """Those that count, by seed, lowest first."""
-    seeds: list[str] = field(default_factory=list)
-    """All that were tried, lowest first."""
-
-
-@dataclass
-class Row:
-    """A row of the table: a variant and its metrics."""
-
-    variant: Variant
     is_reference: bool = False
     differs: list[str] = field(default_factory=list)
     """How its protocol, data or split differ from those of the reference."""
@@ -75,19 +68,9 @@ class Row:
     """Metrics in which no comparable row is better."""
 
     @property
-    def label(self) -> str:
-        """The row's name."""
-        return self.variant.label
-
-    @property
-    def runs(self) -> dict[str, Repetition]:
-        """Runs that count, by seed."""
-        return self.variant.runs
-
-    @property
     def counted(self) -> str:
         """``3`` if all seeds that were tried count, else ``2 of 3``."""
-        done, tried = len(self.runs), len(self.variant.seeds)
+        done, tried = len(self.runs), len(self.seeds)
         return str(done) if done == tried else f"{done} of {tried}"
 
 
@@ -95,7 +78,7 @@ class Row:
 class Rows:
     """A sweep, sorted into rows."""
 
-    variants: list[Variant]
+    rows: list[Row]
     factors: list[Factor]
     troubles: list[Trouble]
 
@@ -111,12 +94,12 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[Run]], Itera
     groups: dict[str, list[tuple[Run, Result | str]]] = {}
     for run in track(sweep.runs):
         groups.setdefault(variant_key(run.config), []).append((run, _result(run, protocol)))
-    variants = [_variant([run for run, _ in group]) for group in groups.values()]
-    factors = find_factors([each.config for each in variants])
-    _label(variants, factors)
-    troubles = [each for row, group in zip(variants, groups.values(), strict=True) for each in _fill(row, group)]
-    troubles += [_never_composed(labels, error, variants) for labels, error in sweep.uncomposed]
-    return Rows(variants, factors, troubles)
+    rows = [_new_row([run for run, _ in group]) for group in groups.values()]
+    factors = find_factors([row.config for row in rows])
+    _label(rows, factors)
+    troubles = [each for row, group in zip(rows, groups.values(), strict=True) for each in _fill(row, group)]
+    troubles += [_never_composed(labels, error, rows) for labels, error in sweep.uncomposed]
+    return Rows(rows, factors, troubles)
 
 
 def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -> Row:
@@ -138,7 +121,7 @@ def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -
     if name is None:
         return usable[0]
     found = [row for row in table if row.label == name]
-    found = found or [row for row in table if name in (row.variant.named, *row.variant.named.split(" / "))]
+    found = found or [row for row in table if name in (row.named, *row.named.split(" / "))]
     if not found:
         labels = [row.label for row in table]
         known = ", ".join(f"'{label}'" for label in labels[:8]) + (f" and {len(labels) - 8} more" * (len(labels) > 8))
@@ -168,27 +151,26 @@ def _result(run: Run, protocol: str) -> Result | str:
         return str(error)
 
 
-def _variant(runs: Sequence[Run]) -> Variant:
+def _new_row(runs: Sequence[Run]) -> Row:
     names = dict.fromkeys(run.labels[VARIANT] for run in runs if run.labels.get(VARIANT))
-    return Variant(variant(runs[0].config), " / ".join(names), seeds=sort_seeds(seed_of(run.config) for run in runs))
+    return Row(variant(runs[0].config), " / ".join(names), sort_seeds(seed_of(run.config) for run in runs))
 
 
-def _label(variants: Sequence[Variant], factors: Sequence[Factor]) -> None:
+def _label(rows: Sequence[Row], factors: Sequence[Factor]) -> None:
     """Name each row after its label ``variant``, and after its factors if that is not unique."""
-    times = Counter(each.named for each in variants)
-    taken: Counter[str] = Counter()
-    for number, each in enumerate(variants):
-        each.factors = [factor.shown[number] for factor in factors]
-        cells = zip(factors, each.factors, strict=True)
+    times, taken = Counter(row.named for row in rows), Counter[str]()
+    for number, row in enumerate(rows):
+        row.factors = [factor.shown[number] for factor in factors]
+        cells = zip(factors, row.factors, strict=True)
         words = [f"{factor.name}={cell}" for factor, cell in cells if cell != ABSENT]
-        if each.named:
-            words = [each.named] if times[each.named] == 1 else [each.named, *words]
+        if row.named:
+            words = [row.named] if times[row.named] == 1 else [row.named, *words]
         label = ", ".join(words) or "all runs"
         taken[label] += 1
-        each.label = label if taken[label] == 1 else f"{label} #{taken[label]}"  # shortened values can look alike
+        row.label = label if taken[label] == 1 else f"{label} #{taken[label]}"  # shortened values can look alike
 
 
-def _fill(row: Variant, group: Sequence[tuple[Run, Result | str]]) -> list[Trouble]:
+def _fill(row: Row, group: Sequence[tuple[Run, Result | str]]) -> list[Trouble]:
     """Give a row the runs that count; return the others."""
     group = sorted(group, key=lambda pair: pair[0].path.name)
     last = {seed_of(run.config): (run, found) for run, found in group if isinstance(found, Result)}
@@ -206,9 +188,9 @@ def _fill(row: Variant, group: Sequence[tuple[Run, Result | str]]) -> list[Troub
     return troubles
 
 
-def _never_composed(labels: dict[str, str], error: str, variants: Sequence[Variant]) -> Trouble:
+def _never_composed(labels: dict[str, str], error: str, rows: Sequence[Row]) -> Trouble:
     named, seed = labels.get(VARIANT, ""), labels.get("seed", ABSENT)
-    row = next((each for each in variants if named and named in each.named.split(" / ")), None)
+    row = next((each for each in rows if named and named in each.named.split(" / ")), None)
     if row is not None and seed != ABSENT:
         row.seeds = sort_seeds([*row.seeds, seed])
     words = [f"{key}={value}" for key, value in labels.items() if key not in (VARIANT, "seed")]

@@ -69,11 +69,11 @@ def table_tex(report: Report) -> str:
 
 def _results(report: Report, metrics: Sequence[str], form: Form) -> Table:
     digits = words.places(report)
-    factors = report.factors if form == "markdown" and report.rows[0].variant.named else []
+    factors = report.factors if form == "markdown" and report.rows[0].named else []
     table = Table(["", *(factor.name for factor in factors), "seeds", *map(words.heading, metrics)])
     for row in report.rows:
         cells = (_cell(row, name, digits[name], form) for name in metrics)
-        table.add(_label(row, form), *(row.variant.factors if factors else ()), row.counted, *cells)
+        table.add(_label(row, form), *(row.factors if factors else ()), row.counted, *cells)
     return table
 
 

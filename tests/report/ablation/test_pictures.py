@@ -19,10 +19,10 @@ from hudepth.report.ablation.effects import COLOURS, draw_effects
 from hudepth.report.ablation.estimates import Estimate, Interval
 from hudepth.report.ablation.heatmap import draw_heatmap, find_grid
 from hudepth.report.ablation.report import Report
-from hudepth.report.ablation.sheet import draw_sheet
 from hudepth.report.ablation.variants import band, draw_variants
 from hudepth.viz.limits import usual_range
 from hudepth.viz.panels import Panel, save_figure
+from hudepth.viz.sheet import draw_sheet
 
 
 def rendered(figure: Figure) -> Any:
