@@ -67,9 +67,7 @@ def _compute(rows: Rows, sweep: Sweep, options: SweepOptions) -> Report:
             rows, protocol=options.protocol, reference=options.reference, repeats=options.repeats, seed=options.seed
         )
     except HudepthError:  # without a table, this is what explains why there is none
-        for each in rows.troubles:
-            log.warning("%s: %s%s", each.run or each.row, each.state, f": {each.why}" if each.why else "")
-        for line in sweep.notes:
+        for line in (*rows.troubles, *sweep.notes):
             log.warning("%s", line)
         raise
 

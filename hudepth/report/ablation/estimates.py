@@ -12,7 +12,7 @@ each: among many rows some differ by chance.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,14 +79,13 @@ def over_seeds(values: Sequence[float]) -> Interval:
 
 
 def estimate(name: str, values: Mapping[str, float], draws: Mapping[str, Draws]) -> Estimate:
-    """Return a metric of a row.
+    """Return a metric of a row from its values by seed, at least one.
 
-    Args:
-        name: of the metric.
-        values: the metric by seed; at least one.
-        draws: by seed, of the same images and with the same draws; empty if the seeds were tested on different images.
+    ``draws`` holds resampled metrics by seed, of the same images and with the same draws; it is empty if the seeds were
+    tested on different images.
     """
-    return Estimate(dict(values), _mean(list(values.values())), over_seeds(list(values.values())), _scenes(name, draws))
+    numbers = list(values.values())
+    return Estimate(dict(values), _mean(numbers), over_seeds(numbers), _over_scenes(name, draws.values()))
 
 
 def contrast(
@@ -98,24 +97,14 @@ def contrast(
 ) -> Contrast | None:
     """Return how a row differs from the reference in a metric, paired by seed; None if they have no seed in common.
 
-    Args:
-        name: of the metric.
-        row: its values by seed.
-        reference: those of the reference.
-        row_draws: by seed.
-        reference_draws: the same sets of scenes by seed.
+    Values and draws are by seed, the draws of the same images and with the same draws of scenes.
     """
     paired = [seed for seed in reference if seed in row]
     if not paired:
         return None
     steps = [row[seed] - reference[seed] for seed in paired]
-    seeds = over_seeds(steps)
-    scenes = _scenes(
-        name,
-        {seed: row_draws[seed] for seed in paired if seed in row_draws},
-        {seed: reference_draws[seed] for seed in paired if seed in reference_draws},
-    )
-    value = _mean(steps)
+    sides = ([draws[seed] for seed in paired if seed in draws] for draws in (row_draws, reference_draws))
+    value, seeds, scenes = _mean(steps), over_seeds(steps), _over_scenes(name, *sides)
     return Contrast(value, seeds, scenes, paired, verdict(name, value, seeds, scenes))
 
 
@@ -131,12 +120,12 @@ def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values) if all(map(math.isfinite, values)) else math.nan
 
 
-def _scenes(name: str, draws: Mapping[str, Draws], minus: Mapping[str, Draws] | None = None) -> Interval:
+def _over_scenes(name: str, draws: Collection[Draws], minus: Collection[Draws] = ()) -> Interval:
     """Return the interval of the mean over seeds, of a metric or of its differences."""
-    sides = [*draws.values(), *(minus or {}).values()]
+    sides = [*draws, *minus]
     if not draws or not all(name in each.metrics for each in sides):
         return Interval()
-    total = np.mean([each.metrics[name] for each in draws.values()], axis=0)
-    if minus is not None:
-        total = total - np.mean([each.metrics[name] for each in minus.values()], axis=0)
+    total = np.mean([each.metrics[name] for each in draws], axis=0)
+    if minus:
+        total = total - np.mean([each.metrics[name] for each in minus], axis=0)
     return Interval(*interval_of(total, min(each.scenes[name] for each in sides)))

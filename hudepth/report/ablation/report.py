@@ -121,14 +121,12 @@ def _compute(
         draws = _own_draws(row, metrics, sampler)
     else:
         draws = _draws(row, first, metrics, sampler)
-    values = {name: {s: r.result.metrics.get(name, math.nan) for s, r in row.runs.items()} for name in metrics}
-    row.estimates = {name: estimate(name, values[name], draws) for name in metrics}
-    if row is reference or row.differs or reference.differs:
-        return
     for name in metrics:
-        found = contrast(name, values[name], reference.estimates[name].values, draws, basis)
-        if found is not None:
-            row.contrasts[name] = found
+        values = {seed: each.result.metrics.get(name, math.nan) for seed, each in row.runs.items()}
+        row.estimates[name] = estimate(name, values, draws)
+        if row is not reference and not row.differs and not reference.differs:
+            found = contrast(name, values, reference.estimates[name].values, draws, basis)
+            row.contrasts |= {name: found} if found else {}
 
 
 def _own_draws(row: Row, metrics: Sequence[str], like: Resampler) -> dict[str, Draws]:
@@ -139,12 +137,11 @@ def _own_draws(row: Row, metrics: Sequence[str], like: Resampler) -> dict[str, D
     return _draws(row, first, metrics, Resampler(first.table, repeats=like.repeats, seed=like.seed))
 
 
-def _mark_best(table: Sequence[Row], metrics: Sequence[str]) -> None:
-    comparable = [row for row in table if row.runs and not row.differs]
-    for name in metrics if len(comparable) > 1 else ():
-        sign = 1 if metric_info(name).higher_is_better else -1
-        means = {id(row): sign * row.estimates[name].mean for row in comparable}
-        top = max((mean for mean in means.values() if not math.isnan(mean)), default=math.nan)
-        for row in comparable:
-            if means[id(row)] == top:
+def _mark_best(rows: Sequence[Row], metrics: Sequence[str]) -> None:
+    rows = [row for row in rows if row.runs and not row.differs]
+    for name in metrics if len(rows) > 1 else ():
+        means = [row.estimates[name].mean for row in rows if not math.isnan(row.estimates[name].mean)]
+        best = (max if metric_info(name).higher_is_better else min)(means, default=math.nan)
+        for row in rows:
+            if row.estimates[name].mean == best:
                 row.best.add(name)

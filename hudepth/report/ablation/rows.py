@@ -30,9 +30,12 @@ class Trouble:
     row: str
     seed: str
     state: str
-    """``failed``, ``pruned``, ``interrupted``, ``running``; ``not composed``; finished but ``no result`` or
-    ``repeated``."""
+    """``failed``, ``pruned``, ``interrupted``, ``running``, ``not composed``, ``no result`` or ``repeated``."""
     why: str
+
+    def __str__(self) -> str:
+        run = f"'{self.run}'" if self.run else "a job"
+        return f"{run} of row '{self.row}', seed {self.seed}: {self.state}{f': {self.why}' if self.why else ''}"
 
 
 @dataclass(frozen=True)

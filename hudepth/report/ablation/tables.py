@@ -32,10 +32,7 @@ def print_table(report: Report) -> None:
     )
     table.show(LOG_WIDTH, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     for each in report.troubles:
-        run = f"'{each.run}' of row" if each.run else "a job of row"
-        why = f": {each.why}" if each.why else ""
-        line = f"not counted: {run} '{each.row}', seed {each.seed}: {each.state}{why}"
-        stdout(LOG_WIDTH).print(line, markup=False, highlight=False, soft_wrap=True)
+        stdout(LOG_WIDTH).print(f"not counted: {each}", markup=False, highlight=False, soft_wrap=True)
 
 
 def table_md(report: Report) -> str:
@@ -44,11 +41,10 @@ def table_md(report: Report) -> str:
     if any(row.contrasts for row in report.rows):
         text += f"\nDifference from {escape_markdown(report.reference.label)}:\n\n{_differences(report).to_markdown()}"
     text += f"\n{escape_markdown(f'{words.about(report)}; {words.seeds(report)}. {words.method(report)}')}\n"
-    lines = [*report.warnings]
-    for each in report.troubles:
-        why = f": {each.why}" if each.why else ""
-        lines.append(f"not counted: {each.run or each.row}, seed {each.seed}: {each.state}{why}")
-    return text + "".join(f"{'' if number else chr(10)}- {escape_markdown(x)}\n" for number, x in enumerate(lines))
+    lines = [
+        f"- {escape_markdown(line)}\n" for line in (*report.warnings, *(f"not counted: {x}" for x in report.troubles))
+    ]
+    return "".join([text, *(["\n", *lines] if lines else [])])
 
 
 def table_tex(report: Report) -> str:

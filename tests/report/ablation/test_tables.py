@@ -88,7 +88,7 @@ def test_markdown_rows_have_one_width_and_names_cannot_break_them(report: Report
     assert any(line.startswith("| si&#124;log & &lt;b> |") for line in lines)
     assert "Difference from paper:" in lines
     assert any(re.match(r"\| no_scale \| .* (better|worse|not shown) \|", line) for line in lines)
-    assert "- not counted: z_failed, seed 4: failed: loss is &lt;nan> & more" in lines
+    assert "- not counted: 'z_failed' of row 'paper', seed 4: failed: loss is &lt;nan> & more" in lines
 
 
 def structure(text: str) -> list[str]:
