@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
-from omegaconf import DictConfig
+from typing import Any, Literal
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.options import convert, parse, plain
 
 
-def report(cfg: DictConfig) -> None:
+def report(cfg: Any) -> None:
     """Run the verb ``compare``, ``table``, ``sweep`` or ``figures``.
 
     Args:

@@ -18,7 +18,6 @@ from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.rows import Row
 from hudepth.report.ablation.variants import draw_variants
 from hudepth.report.compare import tested_on_training_data
-from hudepth.runs.run import BEST, CHECKPOINTS, LAST
 from hudepth.viz.panels import save_figure
 
 IMAGES, NETWORKS = 4, 12
@@ -128,8 +127,7 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
     usable = {
         label: each.run.path
         for label, each in runs.items()
-        if any((each.run.path / CHECKPOINTS / name).is_file() for name in (BEST, LAST))
-        and tested_on_training_data(each.result)
+        if each.run.checkpoint and tested_on_training_data(each.result)
     }
     if not usable:
         log.info("no panels.png: no run has its checkpoint and was tested on the data it was trained on")

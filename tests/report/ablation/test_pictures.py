@@ -1,10 +1,8 @@
-"""Pictures of a sweep: effects, curves, heat map, cost, predictions."""
+"""Pictures of a sweep: effects, curves, heat map, cost."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,30 +18,12 @@ from hudepth.report.ablation.estimates import Estimate, Interval
 from hudepth.report.ablation.heatmap import draw_heatmap, find_grid
 from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.variants import band, draw_variants
-from hudepth.viz.limits import usual_range
-from hudepth.viz.panels import Panel, save_figure
-from hudepth.viz.sheet import draw_sheet
 
 
 def rendered(figure: Figure) -> Any:
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     return canvas.get_renderer()
-
-
-@pytest.mark.parametrize(
-    ("values", "ends"),
-    [
-        ([1, 2, 3], (1, 3)),
-        ([1, 2, 3, 1000], (1, 3)),
-        ([-900, 1, 2, 3, math.nan, math.inf], (1, 3)),
-        ([2, 2, 2, 9], (2, 9)),
-        ([], (0, 1)),
-        ([5], (5, 5)),
-    ],
-)
-def test_what_is_far_out_does_not_set_the_scale(values: list[float], ends: tuple[float, float]) -> None:
-    assert usual_range(values) == ends
 
 
 def test_effects_have_a_dot_a_row_at_its_difference_in_the_colour_of_its_verdict(report: Report) -> None:
@@ -124,29 +104,3 @@ def test_cost_has_a_point_a_row_and_keeps_those_far_out_in_sight() -> None:
         "parameters [millions]",
         "multiply-adds per image [billions]",
     ]
-
-
-def panels(count: int, *, pred_m: float = 2.0) -> list[Panel]:
-    rng = np.random.default_rng(0)
-    truth = rng.uniform(1, 4, (count, 24, 32)).astype(np.float32)
-    image = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
-    return [Panel(image, each, np.full((24, 32), pred_m, dtype=np.float32)) for each in truth]
-
-
-def test_the_sheet_has_a_row_for_image_truth_and_each_network_on_one_scale() -> None:
-    name = "boundary_smoothness_and_a_very_long_name_indeed"
-    figure = draw_sheet({"paper": panels(3), name: panels(3, pred_m=9.0)}, titles=["a", "b", "c"])
-    box = rendered(figure)
-    cells = figure.axes[:-1]
-    assert len(cells) == 4 * 3
-    scales = {axis.images[0].get_clim() for axis in cells[3:]}
-    assert len(scales) == 1
-    words = [text for axis in cells for text in axis.texts]
-    assert [text.get_text().replace("\n", "") for text in words] == ["image", "ground truth", "paper", name]
-    assert min(text.get_window_extent(box).x0 for text in words) >= 0
-
-
-def test_a_sheet_without_any_truth_is_drawn_all_the_same(tmp_path: Path) -> None:
-    unmeasured = [replace(panel, truth_m=np.zeros_like(panel.truth_m)) for panel in panels(1)]
-    save_figure(tmp_path / "panels.png", draw_sheet({"x": unmeasured}))
-    assert (tmp_path / "panels.png").read_bytes().startswith(b"\x89PNG")
