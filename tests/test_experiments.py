@@ -23,8 +23,8 @@ STUDIES = Path(__file__).parents[1] / "experiments"
         ("validation abs_rel", "val/abs_rel", min),
         (r"validation rmse \[m\]", "val/rmse", min),
         ("validation delta1", "val/delta1", max),
-        ("validation loss", "val/total", min),
-        ("training loss", "train/total", min),
+        ("validation loss", "val/loss/total", min),
+        ("training loss", "train/loss/total", min),
     ],
 )
 def test_epochs(label: str, key: str, best: object) -> None:
@@ -59,7 +59,7 @@ def test_units() -> None:
     text = " ".join((STUDIES / "units" / "README.md").read_text().split())
     right, literal = (find_result(STUDIES / "units" / f"units_{name}", "paper") for name in ("right", "paper_literal"))
     last = read_history(STUDIES / "units" / "units_paper_literal" / "metrics.csv")[-1]
-    assert f"has SSIM {literal.metrics['ssim']:.3f} and a validation loss of {last['val/total']:.4f}" in text
+    assert f"has SSIM {literal.metrics['ssim']:.3f} and a validation loss of {last['val/loss/total']:.4f}" in text
     assert f"has SSIM {literal.document['metrics']['mean_depth']['ssim']:.3f}. Read rightly" in text
     assert f"abs_rel {literal.metrics['abs_rel']:.3f} against {right.metrics['abs_rel']:.3f}" in text
     assert f"rmse came to {literal.metrics['rmse']:.3f}" in text
@@ -155,7 +155,7 @@ def test_what_the_study_of_the_model_that_comes_along_says_of_its_trainings() ->
     assert f"to {best[0]['val/delta1']:.3f} at the best abs_rel and to {first[59]['val/delta1']:.3f} after" in text
     fifth, last = second[4], second[-1]
     assert f"falls from {fifth['val/abs_rel']:.3f} to {last['val/abs_rel']:.3f}" in text
-    assert f"training loss by {100 * (1 - last['train/total'] / fifth['train/total']):.0f} %" in text
+    assert f"training loss by {100 * (1 - last['train/loss/total'] / fifth['train/loss/total']):.0f} %" in text
     before, now = (find_result(study / name, "eigen").metrics for name in ("first", "."))
     assert f"abs_rel {before['abs_rel']:.3f}, delta1 {before['delta1']:.3f})" in text
     assert (
@@ -164,7 +164,7 @@ def test_what_the_study_of_the_model_that_comes_along_says_of_its_trainings() ->
     paper = find_result(STUDIES / "badcl_official", "eigen").metrics
     assert f"Abs_rel is {100 * (1 - now['abs_rel'] / paper['abs_rel']):.0f} % lower" in text
     chosen = json.loads((study / "nyu" / "config.json").read_text())["epoch"]
-    losses = [row["train/total"] for row in read_history(study / "metrics.csv")]
+    losses = [row["train/loss/total"] for row in read_history(study / "metrics.csv")]
     assert chosen == len(losses) - 1 == losses.index(min(losses)) + 1  # the last but one
 
 

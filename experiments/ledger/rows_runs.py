@@ -155,7 +155,7 @@ def units_of_runs_row(runs: Sequence[Run]) -> Row:
             continue
         both = (a, b) if a.misread else (b, a)
         epoch = min(a.last_epoch, b.last_epoch)
-        rows = [[run.at_epoch(epoch, f"val/{name}") for name in ("ssim", "total", "abs_rel")] for run in both]
+        rows = [[run.at_epoch(epoch, f"val/{name}") for name in ("ssim", "loss/total", "abs_rel")] for run in both]
         for run, row, word in zip(both, rows, ("as millimetres", "rightly"), strict=True):
             cells.append([run.name, word, str(epoch), *(shown(value, digits=4) for value in row)])
         (ssim_misread, *_), (ssim_right, *_) = rows

@@ -68,7 +68,7 @@ def write_run(run: Path, seed: int, weights: dict[str, float], values: np.ndarra
     (run / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     (run / "status.json").write_text(json.dumps({"state": "finished"}))
     (run / "environment.json").write_text(json.dumps({"packages": {"hudepth": "0.1.0"}}))
-    names = ("train/total", "val/total", "val/abs_rel", "val/rmse", "val/delta1")
+    names = ("train/loss/total", "val/loss/total", "val/abs_rel", "val/rmse", "val/delta1")
     history = [
         ",".join(map(str, (e, e * 88, *(0.2 + 0.5 / e + 0.01 * k for k in range(5))))) for e in range(1, EPOCHS + 1)
     ]

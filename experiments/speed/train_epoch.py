@@ -31,9 +31,9 @@ from hudepth.base.machine import keep_freed_memory
 from hudepth.base.types import Batch
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule, preprocess
-from hudepth.training.checks import MEMORY_FORMATS
 from hudepth.training.fit import build_module
 from hudepth.training.module import DepthModule
+from hudepth.training.options import MEMORY_FORMATS
 from hudepth.training.trainer import build_callbacks, build_run_trainer
 
 
@@ -86,7 +86,7 @@ def real_epoch(config: dict[str, Any], data: DepthDataModule, net: torch.nn.Modu
     """Train one epoch as hudepth-train does, without validation; return its seconds."""
     watch = Stopwatch()
     with tempfile.TemporaryDirectory() as folder, without_known_warnings(), quiet():
-        callbacks = build_callbacks({**config, "monitor": "train/total"}, Path(folder), data)
+        callbacks = build_callbacks({**config, "monitor": "train/loss/total"}, Path(folder), data)
         trainer = build_run_trainer(config, Path(folder), [watch, *callbacks], alone=True)
         trainer.fit(new_module(config, data, net), datamodule=data)
     return watch.seconds

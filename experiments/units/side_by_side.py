@@ -23,7 +23,7 @@ def row(name: str, run: Path) -> tuple[str, list[float], Result]:
     """Return what a run reached, and its test result."""
     last = read_history(run / "metrics.csv")[-1]
     result = find_result(run, "paper")
-    return name, [last["train/total"], last["val/total"], *(result.metrics[m] for m in METRICS)], result
+    return name, [last["train/loss/total"], last["val/loss/total"], *(result.metrics[m] for m in METRICS)], result
 
 
 def main(right: Path, literal: Path) -> None:

@@ -8,23 +8,22 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hudepth.base.errors import DataError
-from hudepth.metrics.summary import DEPTH_NAMES
 
 
 def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> Figure:
     """Draw training and validation curves of the total loss and of its terms, one plot each.
 
     Args:
-        history: rows with ``epoch``, ``train/<name>`` and ``val/<name>``.
+        history: rows with ``epoch``, ``train/loss/<term>`` and ``val/loss/<term>``.
         title: of the figure.
 
     Raises:
         DataError: if the history holds no training loss.
     """
-    names = [key.removeprefix("train/") for key in history[0] if key.startswith("train/")]
+    names = [key.removeprefix("train/loss/") for key in history[0] if key.startswith("train/loss/")]
     if not names:
         raise DataError(
-            "the history of epochs has no training loss (train/total). Pass the metrics.csv of a training run."
+            "the history of epochs has no training loss (train/loss/total). Pass the metrics.csv of a training run."
         )
     names.sort(key=lambda name: name != "total")
     figure = Figure(figsize=(3.4 * len(names), 3.2), dpi=110, layout="constrained")
@@ -33,9 +32,7 @@ def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> F
     first, last = history[0]["epoch"], history[-1]["epoch"]
     for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         for stage, label in (("train", "training"), ("val", "validation")):
-            key = f"{stage}/{name}"
-            if stage == "val" and name in DEPTH_NAMES:  # the metric of that name, in another unit: silog
-                continue
+            key = f"{stage}/loss/{name}"
             points = [(row["epoch"], row[key]) for row in history if key in row]  # not every epoch validates
             if points:
                 axis.plot(*zip(*points, strict=True), marker=".", label=label)

@@ -1,4 +1,4 @@
-"""One job of a sweep: a training that keeps its words and its errors to its own run directory."""
+"""One job of a sweep: a training that writes its output and its errors to its own run directory."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from hudepth.runs.status import LockedError, read_status, write_status
 def run_job(cfg: DictConfig) -> None:
     """Train as one job of a sweep.
 
-    Whatever fails is in the run's status and log, never raised: the other jobs go on. What a training prints goes to
-    its train.log; only warnings reach the terminal.
+    Errors end up in the run's status and log and are never raised, so that the other jobs continue. Output goes to
+    train.log; only warnings reach the terminal.
 
     Args:
         cfg: of the job, as for :func:`hudepth.training.command.train`.
@@ -35,32 +35,30 @@ def run_job(cfg: DictConfig) -> None:
     try:
         with (path / "train.log").open("a", encoding="utf-8") as log, contextlib.redirect_stdout(log):
             train(cfg)
-    except LockedError as error:  # not this process's run to call failed
+    except LockedError as error:  # another process runs this job, which has not failed
         logging.getLogger("hudepth").warning("%s", error)
     except Exception as error:
-        _failed(path, error)
+        _write_failure(path, error)
 
 
-def _failed(path: Path, error: Exception) -> None:
-    """Leave the line and the traceback in the run directory, whoever raised."""
-    line = one_line(error, "train")
+def _write_failure(path: Path, error: Exception) -> None:
     status = read_status(path)
     with contextlib.suppress(OSError):  # a full disk: the launcher's process finds the run unfinished
         if status.get("state") != "failed" or status.get("pid") != os.getpid():
             with (path / "train.log").open("a", encoding="utf-8") as log:
                 log.write(traceback.format_exc())
-        write_status(path, "failed", error=line)
+        write_status(path, "failed", error=one_line(error, "train"))
 
 
 def _share_machine(cfg: DictConfig) -> None:
-    """Divide the cores among jobs that run side by side, and deal out the GPUs in turn."""
+    """Divide the cores among jobs that run in parallel, and assign the GPUs in turn."""
     hydra = HydraConfig.get()
-    side_by_side = hydra.launcher.get("n_jobs")
-    if side_by_side in (None, 1):
+    parallel = hydra.launcher.get("n_jobs")
+    if parallel in (None, 1):
         return
     import torch
 
-    torch.set_num_threads(max(1, usable_cores() // side_by_side) if side_by_side > 0 else 1)
+    torch.set_num_threads(max(1, usable_cores() // parallel) if parallel > 0 else 1)
     gpus = torch.cuda.device_count()
     if gpus > 1 and cfg.trainer.accelerator in ("auto", "gpu", "cuda"):
         cfg.trainer.devices = [int(hydra.job.num) % gpus]

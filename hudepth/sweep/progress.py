@@ -1,6 +1,6 @@
-"""How a sweep goes: a line whenever a job has finished an epoch, ended or failed, whatever runs the jobs.
+"""The progress of a sweep: a line whenever a job has finished an epoch, ended or failed.
 
-It reads what runs leave in their directories, so it works for jobs in this process, in others and on other machines.
+It reads the run directories, so it works for jobs in this process, in others and on other machines.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from types import TracebackType
 from typing import Any
 
 from hudepth.base.console import duration
-from hudepth.base.errors import HudepthError
-from hudepth.runs.history import read_history
+from hudepth.base.errors import DataError
+from hudepth.runs import history
 from hudepth.runs.status import FAILED, FINISHED, PRUNED, read_status
 from hudepth.sweep.jobs import Job
 
 EVERY_S = 0.5
-"""How often the directories are looked at."""
+"""How often the directories are read."""
 
 
 def say(line: str) -> None:
-    """Print a line of the sweep; not to the log, which may be a job's."""
+    """Print a line of the sweep; the log may be that of a job."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -32,7 +32,7 @@ class Progress:
     """Watches jobs while they run.
 
     Args:
-        jobs: that are launched now.
+        jobs: that are launched.
         folder: of the sweep.
         monitor: the metric to show.
     """
@@ -44,42 +44,44 @@ class Progress:
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Progress:
-        """Begin to watch."""
+        """Start watching."""
         self._thread.start()
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
-        """Look a last time, and stop."""
+        """Print what is new, and stop."""
         self._stop.set()
         self._thread.join()
-        self._look()
+        self._print_news()
 
     def _watch(self) -> None:
         while not self._stop.wait(EVERY_S):
-            self._look()
+            self._print_news()
 
-    def _look(self) -> None:
+    def _print_news(self) -> None:
         for number, (job, watched) in enumerate(self._jobs.items(), start=1):
             while news := watched.news():
-                say(f"[{number}/{len(self._jobs)}] {job.name}: {news}{self._left()}")
+                say(f"[{number}/{len(self._jobs)}] {job.name}: {news}{self._time_left()}")
 
-    def _left(self) -> str:
-        """Estimate the time that all jobs still need, from the epochs they have finished since the start."""
-        each = list(self._jobs.values())
-        done, left = sum(job.done for job in each), sum(job.left for job in each)
-        if not done or not left:
-            return ""
-        return f"; sweep: {duration((time.monotonic() - self._start) / done * left)} left"
+    def _time_left(self) -> str:
+        done = sum(job.done for job in self._jobs.values())
+        return _left("; sweep: ", self._start, done, sum(job.left for job in self._jobs.values()))
+
+
+def _left(words: str, start: float, done: int, left: int) -> str:
+    """Estimate the time that is left from the epochs since the start; empty if there are none."""
+    each = (time.monotonic() - start) / done if done > 0 else 0
+    return f"{words}{duration(each * left)} left" if done > 0 and left else ""
 
 
 class _Watched:
-    """One job: what was last seen of it."""
+    """What was last seen of a job."""
 
     def __init__(self, path: Path, job: Job, monitor: str) -> None:
         self.path, self.monitor = path, monitor
         config: Any = job.config
         self.epochs = int(config["trainer"].get("max_epochs") or 0)
-        self._stamps = {name: self._stamp(name) for name in ("metrics.csv", "status.json")}
+        self._stamps = {name: self._stamp(name) for name in (history.FILE, "status.json")}
         self._seen, self._metric = self._last_epoch()
         self._first = self._seen
         self._began: float | None = None
@@ -96,14 +98,14 @@ class _Watched:
         return 0 if self._ended else max(0, self.epochs - self._seen)
 
     def news(self) -> str:
-        """Return what happened since the last look, or nothing."""
-        if self._changed("metrics.csv"):
+        """Return what happened since the last call, or an empty string."""
+        if self._has_changed(history.FILE):
             epoch, metric = self._last_epoch()
             if epoch != self._seen:
                 self._seen, self._metric = epoch, metric
                 self._began = self._began or time.monotonic()
-                return f"epoch {epoch} of {self.epochs}{metric}{self._time_left()}"
-        if self._changed("status.json"):
+                return f"epoch {epoch} of {self.epochs}{metric}" + _left(", ", self._began, self.done, self.left)
+        if self._has_changed("status.json"):
             status = read_status(self.path)
             self._ended = status.get("state") in (FINISHED, FAILED, PRUNED)
             if self._ended:
@@ -112,13 +114,7 @@ class _Watched:
             self._began = self._began or time.monotonic()
         return ""
 
-    def _time_left(self) -> str:
-        done = self._seen - self._first
-        if self._began is None or done < 1 or not self.left:
-            return ""
-        return f", {duration((time.monotonic() - self._began) / done * self.left)} left"
-
-    def _changed(self, name: str) -> bool:
+    def _has_changed(self, name: str) -> bool:
         before, self._stamps[name] = self._stamps[name], self._stamp(name)
         return self._stamps[name] != before
 
@@ -131,8 +127,7 @@ class _Watched:
     def _last_epoch(self) -> tuple[int, str]:
         """Return the last epoch of metrics.csv and the words for its metric."""
         try:
-            row = read_history(self.path / "metrics.csv")[-1]
-        except HudepthError:
+            row = history.read_history(self.path / history.FILE)[-1]
+        except DataError:
             return 0, ""
-        metric = f", {self.monitor} {row[self.monitor]:.4f}" if self.monitor in row else ""
-        return int(row["epoch"]), metric
+        return int(row["epoch"]), f", {self.monitor} {row[self.monitor]:.4f}" if self.monitor in row else ""

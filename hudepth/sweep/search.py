@@ -1,17 +1,18 @@
-"""A search over configurations with optuna: each trial is a run of the sweep, and the study a file beside the runs."""
+"""A search over configurations with optuna: each trial is a run of the sweep, and the study a file next to the runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
 
-from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.base.options import whole_number
-from hudepth.runs.status import FINISHED, PRUNED, read_state, read_status
+from hudepth.base.errors import ConfigError
+from hudepth.base.options import Range
+from hudepth.runs.status import FAILED, FINISHED, PRUNED, read_state, read_status
 from hudepth.sweep.jobs import Job, find_done
 from hudepth.sweep.progress import say
 from hudepth.training.study import TRIAL_ENV, import_optuna, open_study
@@ -21,8 +22,23 @@ if TYPE_CHECKING:
 
 
 STUDY_FILE = "study.log"
-OPTIONS = ("trials", "sampler", "seed", "startup_trials", "prune", "warmup_epochs")
-"""Keys of ``hydra.sweeper.search``; conf/hydra/sweeper/hudepth.yaml says what they are."""
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """The group ``hydra.sweeper.search``."""
+
+    trials: Annotated[int, Range(1)] | None = None
+    """In all, with those of earlier calls; None for no search."""
+    sampler: Literal["tpe", "random"] = "tpe"
+    seed: Annotated[int, Range(0)] = 0
+    """Of the sampler."""
+    startup_trials: Annotated[int, Range(0)] = 8
+    """Random trials before the sampler learns from them, and before any is pruned."""
+    prune: bool = True
+    """End a trial whose metric is worse than the median of the others at the same epoch."""
+    warmup_epochs: Annotated[int, Range(0)] = 2
+    """Epochs before a trial can be pruned."""
 
 
 def search(
@@ -30,91 +46,67 @@ def search(
     run_jobs: Callable[[Sequence[Job], Sequence[Job]], None],
     folder: Path,
     *,
-    typed: Sequence[Override],
-    params: Sequence[Override],
-    options: Mapping[str, Any],
+    overrides: Sequence[Override],
+    options: SearchOptions,
     mode: str,
     monitor: str,
     at_once: int,
 ) -> None:
-    """Run trials until there are as many as asked for; trials that were killed go on first.
+    """Run trials until there are as many as asked for; trials that were killed are resumed first.
 
     Args:
         compose: returns jobs with their configurations.
         run_jobs: records all jobs so far, then runs the unfinished ones of the second argument.
         folder: of the sweep; the study lies in it.
-        typed: overrides on the command line.
-        params: overrides of the sweep's file.
-        options: see :data:`OPTIONS`.
+        overrides: of the sweep and of the command line; those with a range of values are searched over.
+        options: of the search.
         mode: ``min`` or ``max``: which way ``monitor`` is better.
         monitor: the metric searched by.
-        at_once: trials to run side by side.
+        at_once: number of trials to run in parallel.
 
     Raises:
-        ConfigError: if optuna is not installed, an option is unknown, nothing is searched over, or all trials failed.
+        ConfigError: if optuna is not installed, nothing is searched over, or all trials failed.
     """
-    check_options(options)
-    mine = {override.key_or_group for override in typed}
-    every = [*(override for override in params if override.key_or_group not in mine), *typed]
-    constants = [str(override.input_line) for override in every if not override.is_sweep_override()]
-    space = {override.get_key_element(): distribution(override) for override in every if override.is_sweep_override()}
+    constants = [str(override.input_line) for override in overrides if not override.is_sweep_override()]
+    space = {each.get_key_element(): distribution(each) for each in overrides if each.is_sweep_override()}
     if not space:
         raise ConfigError("search: nothing to search over. Give a key a range, as in 'loss.boundary=interval(0.3,30)'.")
     direction = "minimize" if mode == "min" else "maximize"
-    study = open_study(str(folder / STUDY_FILE), options, direction=direction)
+    study = open_study(str(folder / STUDY_FILE), asdict(options), direction=direction)
     jobs: list[Job] = []
-    while trials := _next_trials(study, space, at_once, int(options["trials"])):
-        batch = [_job(trial, constants, folder) for trial in trials]
-        batch = find_done(compose(batch), folder)
+    while trials := _next_trials(study, space, at_once, options.trials or 0):
+        batch = find_done(compose([_job(trial, constants, folder) for trial in trials]), folder)
         if all(job.config is None for job in batch) and not jobs:
             raise ConfigError(batch[0].error)
         run_jobs([*jobs, *batch], batch)
-        open_ = [job.name for job in batch if not _tell(study, job, folder)]
-        if open_:  # a launcher lost its process; to try again at once could go on for ever
-            raise ConfigError(f"search: {open_[0]} did not end. Give sweep_dir={folder} again to go on with it.")
+        unfinished = [job.name for job in batch if not _tell(study, job, folder)]
+        if unfinished:  # a launcher lost its process; trying again at once might never end
+            raise ConfigError(f"search: {unfinished[0]} did not end. Resume with sweep_dir={folder}.")
         jobs += batch
     _say_best(study, folder, monitor=monitor)
-
-
-def check_options(options: Mapping[str, Any]) -> None:
-    """Check the options of a search.
-
-    Raises:
-        ConfigError: for an unknown key or a value out of range.
-    """
-    for key in options:
-        if key not in OPTIONS:
-            raise ConfigError(
-                f"hydra.sweeper.search: no '{key}'.{did_you_mean(key, OPTIONS)} It takes {', '.join(OPTIONS)}."
-            )
-    for key, least in (("trials", 1), ("seed", 0), ("startup_trials", 0), ("warmup_epochs", 0)):
-        whole_number(options, key, default=least, least=least)
-    if options["sampler"] not in ("tpe", "random"):
-        raise ConfigError(f"hydra.sweeper.search.sampler: no '{options['sampler']}'. Pass tpe or random.")
 
 
 def distribution(override: Override) -> Any:
     """Return the optuna distribution for an override like ``loss.boundary=tag(log,interval(0.3,30))``.
 
     Raises:
-        ConfigError: if it is no range that optuna knows.
+        ConfigError: if it is not a range that optuna supports.
     """
-    optuna_ = import_optuna()
+    distributions = import_optuna().distributions
     value = override.value()
     log = "log" in getattr(value, "tags", ())
     try:
         if isinstance(value, IntervalSweep):
-            low, high = float(value.start or 0), float(value.end or 0)
-            return optuna_.distributions.FloatDistribution(low, high, log=log)
+            return distributions.FloatDistribution(float(value.start or 0), float(value.end or 0), log=log)
         if isinstance(value, RangeSweep):
-            start, stop, step = value.start or 0, value.stop or 0, value.step  # which, like Python's, ends before stop
+            start, stop, step = value.start or 0, value.stop or 0, value.step  # like Python's, without stop
             if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
                 last = stop - 1 - (stop - 1 - start) % step
-                return optuna_.distributions.IntDistribution(start, last, step=1 if log else step, log=log)
+                return distributions.IntDistribution(start, last, step=1 if log else step, log=log)
             steps = math.ceil((stop - start) / step) - 1
-            return optuna_.distributions.FloatDistribution(float(start), start + steps * step, step=float(step))
+            return distributions.FloatDistribution(float(start), start + steps * step, step=float(step))
         if isinstance(value, ChoiceSweep):
-            return optuna_.distributions.CategoricalDistribution(list(override.sweep_string_iterator()))
+            return distributions.CategoricalDistribution(list(override.sweep_string_iterator()))
     except ValueError as error:
         raise ConfigError(f"'{override.input_line}': {error}") from error
     raise ConfigError(f"'{override.input_line}': pass interval(low,high), range(first,end,step) or choice(a,b).")
@@ -123,44 +115,41 @@ def distribution(override: Override) -> Any:
 def _next_trials(
     study: optuna.study.Study, space: Mapping[str, Any], at_once: int, wanted: int
 ) -> list[optuna.trial.Trial]:
-    """Return the trials to run now: those that were killed, or new ones while there are fewer than wanted."""
-    optuna_ = import_optuna()
+    """Return the trials that were killed, or new ones while there are fewer than wanted."""
+    trial = import_optuna().trial
     every = study.get_trials(deepcopy=False)
-    killed = [each for each in every if each.state == optuna_.trial.TrialState.RUNNING]
-    if killed:
-        return [optuna_.trial.Trial(study, each._trial_id) for each in killed]
+    if killed := [each for each in every if each.state == trial.TrialState.RUNNING]:
+        return [trial.Trial(study, each._trial_id) for each in killed]
     return [study.ask(dict(space)) for _ in range(min(at_once, wanted - len(every)))]
 
 
 def _job(trial: optuna.trial.Trial, constants: Sequence[str], folder: Path) -> Job:
-    labels = {key.lstrip("+~"): _spelt(value) for key, value in trial.params.items()}
-    overrides = [*constants, *(f"{key}={_spelt(value)}" for key, value in trial.params.items())]
-    env = f"'{trial.number}:{folder / STUDY_FILE}'"
-    return Job((*overrides, f"+hydra.job.env_set.{TRIAL_ENV}={env}"), {"trial": str(trial.number), **labels})
+    values = {key: _format_value(value) for key, value in trial.params.items()}
+    env = f"+hydra.job.env_set.{TRIAL_ENV}='{trial.number}:{folder / STUDY_FILE}'"
+    labels = {"trial": str(trial.number), **{key.lstrip("+~"): value for key, value in values.items()}}
+    return Job((*constants, *(f"{key}={value}" for key, value in values.items()), env), labels)
 
 
-def _spelt(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _tell(study: optuna.study.Study, job: Job, folder: Path) -> bool:
-    """Tell the study what came of a trial, and return whether anything did; one that was interrupted stays open."""
-    optuna_ = import_optuna()
-    state = read_state(folder / job.folder)[0] if job.config is not None else "failed"
+    """Report a trial's end to the study, and return whether it has ended; one that was interrupted stays open."""
+    states = import_optuna().trial.TrialState
+    state = read_state(folder / job.folder)[0] if job.config is not None else FAILED
     number, best = int(job.labels["trial"]), read_status(folder / job.folder).get("best")
     if state == FINISHED and isinstance(best, int | float):
         study.tell(number, float(best))
-    elif state == PRUNED:
-        study.tell(number, state=optuna_.trial.TrialState.PRUNED)
-    elif state in ("failed", FINISHED):  # finished with a metric that is not finite
-        study.tell(number, state=optuna_.trial.TrialState.FAIL)
+    elif state in (PRUNED, FAILED, FINISHED):  # finished with a metric that is not finite
+        study.tell(number, state=states.PRUNED if state == PRUNED else states.FAIL)
     else:
         return False
     return True
 
 
 def _say_best(study: optuna.study.Study, folder: Path, *, monitor: str) -> None:
-    """Say which trials were best.
+    """Print the best trials.
 
     Raises:
         ConfigError: if none finished.
@@ -175,5 +164,5 @@ def _say_best(study: optuna.study.Study, folder: Path, *, monitor: str) -> None:
     pruned = sum(trial.state == states.PRUNED for trial in trials)
     say(f"search: {len(done)} trials finished, {pruned} pruned, {len(trials) - len(done) - pruned} failed; in {folder}")
     for place, trial in enumerate(done[:5], start=1):
-        values = " ".join(f"{key}={_spelt(value)}" for key, value in trial.params.items())
+        values = " ".join(f"{key}={_format_value(value)}" for key, value in trial.params.items())
         say(f"  {place}. {monitor} {float(trial.value or 0):.4f}: {values} (trial {trial.number})")

@@ -1,7 +1,7 @@
-"""Sweeps: Hydra's sweeper that runs what is not finished yet, says how it goes, and loses nothing when a job fails.
+"""Hydra's sweeper for hudepth: runs the jobs that are not finished, and survives those that fail.
 
-Hydra parses and composes, its launchers (basic, joblib, submitit, ray) run the jobs; this says which jobs there are,
-where each belongs, and what came of them.
+Hydra parses and composes, its launchers (basic, joblib, submitit, ray) run the jobs. This module decides which jobs
+there are and where each is stored, and reports the outcome.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import shlex
 import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -18,6 +19,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
@@ -25,11 +27,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.machine import usable_cores
-from hudepth.base.options import plain
+from hudepth.base.options import parse, plain
 from hudepth.base.wording import one_line
 from hudepth.runs.status import FAILED, FINISHED, LOCK, PRUNED, read_state
 from hudepth.runs.sweeps import read_jobs, write_jobs
-from hudepth.sweep.jobs import Job, combine, compose, find_done
+from hudepth.sweep.jobs import Job, combine, compose, find_done, merge_overrides
 from hudepth.sweep.progress import Progress, say
 
 
@@ -39,7 +41,7 @@ class Sweep(Sweeper):
     Args:
         params: key: comma-separated values.
         variants: name: overrides.
-        search: how to search instead of trying all, if it has ``trials``; see :mod:`hudepth.sweep.search`.
+        search: options of a search in place of all combinations; see :class:`hudepth.sweep.search.SearchOptions`.
     """
 
     def __init__(
@@ -49,109 +51,100 @@ class Sweep(Sweeper):
         search: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.params, self.search = dict(params or {}), plain_options(search or {})
+        self.params, self.search = dict(params or {}), search or {}
         self.variants = {
             str(name): [str(each) for each in overrides or ()] for name, overrides in (variants or {}).items()
         }
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Take what Hydra gives."""
+        """Store what Hydra provides."""
         self.context, self.task, self.master = hydra_context, task_function, config
 
     def sweep(self, arguments: list[str]) -> None:
         """Run all jobs that are not finished.
 
         Args:
-            arguments: overrides as typed.
+            arguments: the overrides of the command line.
 
         Raises:
-            HudepthError: if nothing can run, or after all, if a job failed.
+            HudepthError: if nothing can run, or at the end, if a job failed.
         """
+        from hudepth.sweep.search import SearchOptions, search  # imports torch, which trainings without -m do later
+
         self._check_slurm()
         folder = self._folder()
         parser = OverridesParser.create(config_loader=self.context.config_loader)
         typed = parser.parse_overrides(list(arguments))
         params = parser.parse_overrides([f"{key}={value}" for key, value in self.params.items()])
-        if self.search.get("trials") is not None:
-            from hudepth.sweep.search import search
-
-            def run_jobs(jobs: Sequence[Job], batch: Sequence[Job]) -> None:
-                self.record(jobs, folder)
-                self.launch([job for job in batch if job.config is not None and not job.finished], folder)
-
-            with _held(folder):
+        overrides = merge_overrides(typed, params)
+        given: Any = OmegaConf.to_container(OmegaConf.create(dict(self.search)), resolve=True)
+        options = parse(SearchOptions, given, prefix="hydra.sweeper.search.", strict=True)
+        if options.trials is not None:
+            with _lock_sweep(folder):
                 search(
-                    self.compose, run_jobs, folder, typed=typed, params=params, options=self.search,
-                    mode=self.master.mode, monitor=str(self.master.monitor),
+                    self.compose, lambda jobs, batch: self.run_batch(jobs, batch, folder), folder, overrides=overrides,
+                    options=options, mode=self.master.mode, monitor=str(self.master.monitor),
                     at_once=max(1, int(self.master.hydra.launcher.get("n_jobs") or 1)),
                 )  # fmt: skip
             return
-        jobs = self.compose(combine(typed, params, self.variants))
+        jobs = self.compose(combine(overrides, self.variants))
         if all(job.config is None for job in jobs):
-            raise ConfigError(jobs[0].error + (f" (so with all {len(jobs)} jobs)" if len(jobs) > 1 else ""))
-        with _held(folder):
+            raise ConfigError(jobs[0].error + (f" (all {len(jobs)} jobs fail like this)" if len(jobs) > 1 else ""))
+        with _lock_sweep(folder):
             self.run(jobs, folder)
 
     def compose(self, jobs: Sequence[Job]) -> list[Job]:
         """Return the jobs with their configurations, see :func:`hudepth.sweep.jobs.compose`."""
 
-        def how(overrides: list[str]) -> dict[str, Any]:
+        def compose_one(overrides: list[str]) -> dict[str, Any]:
             config = self.context.config_loader.load_sweep_config(self.master, overrides)
             with open_dict(config):
                 del config["hydra"]
             return plain(config)
 
-        return compose(jobs, how, lambda error: one_line(error, "train"))
+        return compose(jobs, compose_one, lambda error: one_line(error, "train"))
 
-    def run(self, jobs: Sequence[Job], folder: Path) -> list[Job]:
-        """Run those of the jobs that are not finished; say what came of them.
-
-        Returns:
-            The jobs, with their folders.
+    def run(self, jobs: Sequence[Job], folder: Path) -> None:
+        """Run the jobs that are not finished; report the outcome.
 
         Raises:
-            ConfigError: after all, if a job failed, did not compose or did not end.
+            ConfigError: at the end, if a job failed, did not compose or did not end.
         """
         jobs = find_done(jobs, folder)
-        left = [job for job in jobs if job.config is not None and not job.finished]
-        self.record(jobs, folder)
+        done, left = sum(job.finished for job in jobs), sum(job.is_open for job in jobs)
         for job in jobs:
             if job.error:
                 say(f"{job.name}: {job.error}")
-        done = sum(job.finished for job in jobs)
-        say(f"sweep {self.name}: {len(left)} of {len(jobs)} jobs to run" + (f", {done} finished before" * bool(done)))
+        say(f"sweep {self.name}: {left} of {len(jobs)} jobs to run" + (f", {done} already finished" * bool(done)))
         try:
-            self.launch(left, folder)
+            self.run_batch(jobs, jobs, folder)
         except BaseException:
-            self._say_outcome(jobs, folder)
+            self._report(jobs, folder)
             raise
-        failed, unfinished = self._say_outcome(jobs, folder)
+        failed, unfinished = self._report(jobs, folder)
         if failed:
             more = f"; {len(failed) - 3} more" if len(failed) > 3 else ""
-            words = "; ".join(line.rstrip(".") for line in failed[:3])
+            errors = "; ".join(line.rstrip(".") for line in failed[:3])
             raise ConfigError(
-                f"{len(failed)} of {len(jobs)} jobs failed: {words}{more}. See {_shown(folder)}/*/train.log."
+                f"{len(failed)} of {len(jobs)} jobs failed: {errors}{more}. See {_format_path(folder)}/*/train.log."
             )
         if unfinished:
-            raise ConfigError(
-                f"{unfinished} of {len(jobs)} jobs did not end. Type the command above to go on with them."
-            )
-        return jobs
+            raise ConfigError(f"{unfinished} of {len(jobs)} jobs did not end. Resume them with the command above.")
 
-    def record(self, jobs: Sequence[Job], folder: Path) -> None:
-        """Write the jobs to sweep.yaml."""
-        write_jobs(folder, self.name, [_record(job) for job in jobs])
+    def run_batch(self, jobs: Sequence[Job], batch: Sequence[Job], folder: Path) -> None:
+        """Write all jobs to sweep.yaml, then launch those of a batch that are not finished.
 
-    def launch(self, jobs: Sequence[Job], folder: Path) -> None:
-        """Launch jobs. Where a launcher gives up since one of its processes was killed, the rest is launched anew."""
-        left, where = list(jobs), _quoted(folder)
+        If a launcher gives up since one of its processes was killed, the jobs that had not begun are launched again.
+        """
+        write_jobs(folder, self.name, [job.record() for job in jobs])
+        left = [job for job in batch if job.is_open]
+        with open_dict(self.master):
+            self.master.hydra.sweep.dir = str(folder)
+        place = str(folder).replace("\\", "\\\\").replace("'", "\\'")
         while left:
-            with open_dict(self.master):
-                self.master.hydra.sweep.dir = str(folder)
-            launcher = self._launcher(len(left))
-            start = time.time()
+            launcher, start = self._launcher(len(left)), time.time()
             commands = [
-                [*job.overrides, f"hydra.sweep.dir={where}", f"hydra.sweep.subdir={job.folder}"] for job in left
+                [*job.overrides, f"hydra.sweep.dir='{place}'", f"hydra.sweep.subdir={job.folder}"] for job in left
             ]
             try:
                 with Progress(left, folder, monitor=str(self.master.monitor)):
@@ -159,20 +152,18 @@ class Sweep(Sweeper):
                 return
             except Exception as error:
                 say(f"the launcher stopped: {one_line(error, 'train')}")
-            begun = [job for job in left if _began(folder / job.folder, after=start)]
-            if not begun:
+            waiting = [job for job in left if not _has_begun(folder / job.folder, after=start)]
+            if len(waiting) == len(left):
                 return
-            left = [job for job in left if job not in begun]
+            left = waiting
 
     def _launcher(self, jobs: int) -> Launcher:
-        from hydra.core.plugins import Plugins
-
-        config, typed = self.master, list(self.master.hydra.overrides.hydra)
+        config, overrides = self.master, list(self.master.hydra.overrides.hydra)
         if config.hydra.launcher.get("n_jobs") is not None:
             with open_dict(config):
-                if not any(each.lstrip("+").startswith("hydra.launcher.n_jobs=") for each in typed):
+                if not any(each.lstrip("+").startswith("hydra.launcher.n_jobs=") for each in overrides):
                     config.hydra.launcher.n_jobs = usable_cores()
-                if config.hydra.launcher.n_jobs > jobs:  # a core is not kept for a job that there is not
+                if config.hydra.launcher.n_jobs > jobs:  # each job gets its share of the cores
                     config.hydra.launcher.n_jobs = jobs
         launcher: Launcher = Plugins.instance().instantiate_launcher(
             hydra_context=self.context, task_function=self.task, config=config
@@ -183,63 +174,53 @@ class Sweep(Sweeper):
         target = str(self.master.hydra.launcher._target_)
         if target.endswith("SlurmLauncher") and shutil.which("srun") is None:
             raise ConfigError(
-                "hydra/launcher: there is no SLURM here (no srun on the path). Run it on a cluster's login node, "
+                "hydra/launcher: there is no SLURM here (srun not found). Run this on a cluster's login node, "
                 "or pass hydra/launcher=submitit_local or joblib."
             )
 
     def _report_command(self, folder: Path) -> str:
         protocols = [name for name, protocol in (self.master.protocol or {}).items() if protocol]
-        words = ["hudepth-report", "sweep", f"dir={_shown(folder)}"]
+        words = ["hudepth-report", "sweep", f"dir={_format_path(folder)}"]
         words += [f"name={self.name}"] if len(read_jobs(folder)) > 1 else []
         words += [f"protocol={protocols[0]}"] if protocols and "eigen" not in protocols else []  # its default
         return shlex.join(words)
 
     @property
     def name(self) -> str:
-        """As it was typed, else as its file in conf/sweep is called: an experiment beside it names the runs."""
+        """The name from the command line, else that of the file in conf/sweep; ``name`` in a file names runs only."""
         chosen = self.master.hydra.runtime.choices.get("sweep")
         typed = any(str(each).startswith("name=") for each in self.master.hydra.overrides.task)
         return str(self.master.name if typed or not chosen else chosen)
 
     def _folder(self) -> Path:
-        typed = self.master.get("sweep_dir")
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        folder = Path(str(typed)) if typed else Path(str(self.master.paths.sweeps)) / self.name / stamp
-        return folder.expanduser().resolve()
+        folder = self.master.get("sweep_dir") or Path(str(self.master.paths.sweeps)) / self.name / stamp
+        return Path(str(folder)).expanduser().resolve()
 
-    def _say_outcome(self, jobs: Sequence[Job], folder: Path) -> tuple[list[str], int]:
-        """Say what came of the jobs, and how to go on; return a line for each that failed, and how many did not end."""
+    def _report(self, jobs: Sequence[Job], folder: Path) -> tuple[list[str], int]:
+        """Print the outcome and how to resume; return a line for each failed job, and how many did not end."""
         outcomes = [read_state(folder / job.folder) if job.config else (FAILED, job.error) for job in jobs]
-        states = [state for state, _ in outcomes]
-        count = {state: states.count(state) for state in (FINISHED, FAILED, PRUNED)}
-        unfinished = len(jobs) - sum(count.values())
-        words = [f"{number} {state}" for state, number in count.items() if number or state == FINISHED]
+        count = Counter(state for state, _ in outcomes)
+        unfinished = len(jobs) - count[FINISHED] - count[FAILED] - count[PRUNED]
+        words = [f"{count[state]} {state}" for state in (FINISHED, FAILED, PRUNED) if count[state] or state == FINISHED]
         words += [f"{unfinished} unfinished"] if unfinished else []
         say(f"sweep {self.name}: {', '.join(words)}; in {folder}")
         if self.master.test:
             say(f"table and plots: {self._report_command(folder)}")
         if unfinished or count[FAILED]:
-            say(f"to go on: {_command(folder)}")
+            typed = [word for word in sys.argv[1:] if not word.startswith("sweep_dir=")]
+            say("to resume: " + shlex.join(["hudepth-train", *typed, f"sweep_dir={_format_path(folder)}"]))
         failed = [f"{job.name}: {why}" for job, (state, why) in zip(jobs, outcomes, strict=True) if state == FAILED]
         return failed, unfinished
 
 
-def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a part of Hydra's configuration as plain Python."""
-    return dict(OmegaConf.to_container(options, resolve=True) if OmegaConf.is_config(options) else options)  # type: ignore[arg-type]
-
-
-def _record(job: Job) -> dict[str, Any]:
-    return {"labels": dict(job.labels), **({"run": job.folder} if job.config is not None else {"error": job.error})}
-
-
-def _began(run: Path, *, after: float) -> bool:
+def _has_begun(run: Path, *, after: float) -> bool:
     status = run / "status.json"
     return status.is_file() and status.stat().st_mtime >= after
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
+def _lock_sweep(folder: Path) -> Iterator[None]:
     """Keep a second command from running the same sweep at the same time."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -259,18 +240,6 @@ def _held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _quoted(path: Path) -> str:
-    """Return a path as a quoted value of an override."""
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
-
-
-def _shown(path: Path) -> str:
-    """Return a path relative to here, if it lies here."""
+def _format_path(path: Path) -> str:
+    """Return a path relative to the current directory if it lies below it."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
-
-
-def _command(folder: Path) -> str:
-    """Return the command that was typed, with the sweep's folder."""
-    typed = [word for word in sys.argv[1:] if not word.startswith("sweep_dir=")]
-    return shlex.join(["hudepth-train", *typed, f"sweep_dir={_shown(folder)}"])

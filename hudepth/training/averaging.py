@@ -1,4 +1,4 @@
-"""An exponential moving average of the weights, which validates, and is what checkpoints hold."""
+"""An exponential moving average of the weights, used for validation and stored in checkpoints."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hudepth.base.errors import ConfigError
 
 
 class EMA(WeightAveraging):
-    """Lightning's weight averaging with a decay that begins low, so that early epochs are not those of the first step.
+    """Lightning's weight averaging with a low initial decay, so that the first steps are soon forgotten.
 
-    With each step the average becomes ``d * average + (1 - d) * weights``, d = min(decay, (1 + n) / (10 + n)) after n
-    earlier steps; it begins with the weights of the first. Statistics of batch norm are averaged, too. The average
-    validates and draws, and is what ``best.ckpt`` holds; ``last.ckpt`` holds the weights beside it.
+    Each step sets the average to ``d * average + (1 - d) * weights``, d = min(decay, (1 + n) / (10 + n)) after n
+    earlier steps, starting from the weights of the first. Statistics of batch norm are averaged, too. Validation and
+    pictures use the average, and ``best.ckpt`` holds it; ``last.ckpt`` holds the trained weights as well.
 
     Args:
         decay: in [0, 1); 0.998 averages over some 500 steps.
@@ -34,15 +34,15 @@ class EMA(WeightAveraging):
         super().__init__(multi_avg_fn=self._average)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Copy the network to where it is going to train; Lightning moves the network itself only later."""
+        """Copy the network to the device it will train on; Lightning moves the network itself later."""
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            self._average_model.n_averaged = self._average_model.n_averaged.cpu()  # it is read at every step
+            self._average_model.n_averaged = self._average_model.n_averaged.cpu()  # read at every step
 
     @torch.no_grad()
     def _average(self, averaged: Sequence[Tensor], current: Sequence[Tensor], count: Tensor | int) -> None:
-        steps = self._latest_update_step  # not ``count``, which lies on the device: reading it would wait for that
+        steps = self._latest_update_step  # not ``count``: reading it would wait for the device
         share = 1 - min(self.decay, (1 + steps) / (10 + steps))
         if averaged[0].is_floating_point():
             torch._foreach_lerp_(list(averaged), list(current), share)
@@ -57,9 +57,9 @@ class EMA(WeightAveraging):
 
 
 def averaged_state(trainer: Trainer | None, checkpoint: dict[str, Any]) -> dict[str, Tensor] | None:
-    """Return the averaged weights that belong into a checkpoint that lacks them, or None.
+    """Return the averaged weights for a checkpoint that lacks them, or None.
 
-    Lightning hands checkpoints to the averaging callback unless they hold weights only, which ``best.ckpt`` does.
+    Lightning passes checkpoints to the averaging callback unless they hold only weights, as ``best.ckpt`` does.
     """
     for callback in getattr(trainer, "callbacks", []):
         if isinstance(callback, EMA) and callback._average_model is not None:

@@ -1,4 +1,4 @@
-"""The LightningModule: it joins network, loss and metrics, and holds no mathematics of its own."""
+"""The LightningModule, which connects network, loss and metrics."""
 
 from __future__ import annotations
 
@@ -25,12 +25,17 @@ from hudepth.runs import checkpoint as ckpt
 from hudepth.training.averaging import averaged_state
 from hudepth.training.schedules import StepSchedule
 
-LOTS = {"cpu": 1}
-"""After how many steps losses are looked at, by kind of device; else 50, since every look waits for the device."""
+CHECK_EVERY = {"cpu": 1}
+"""Steps between two checks of the loss, by kind of device; 50 on others, since each check waits for the device."""
+
+
+def loss_name(stage: str, term: str = "total") -> str:
+    """Return the name under which a term of the loss is logged: ``train/loss/<term>`` or ``val/loss/<term>``."""
+    return f"{stage}/loss/{term}"
 
 
 class _Step(NamedTuple):
-    """A training step whose loss was not looked at yet."""
+    """A training step whose loss was not checked yet."""
 
     batch_idx: int
     rows: Tensor
@@ -42,19 +47,19 @@ class _Step(NamedTuple):
 class DepthModule(LightningModule):
     """Trains a depth network.
 
-    Logged, for ``train`` and ``val``: ``total`` and every raw term of the loss, as means over the epoch. For ``val``
-    also the metrics of section 3.5 in metres, and SSIM on unit depth (data range 1).
+    Logged: ``train/loss/<term>`` and ``val/loss/<term>``, the total (``total``) and each raw term of the loss as means
+    over the epoch; ``val/<metric>``, the metrics of section 3.5 in metres, and SSIM with ``max_depth_m`` as data range.
 
     Args:
         net: normalised image to unit depth.
         loss: called with prediction, unit depth, image and valid mask; returns :class:`hudepth.base.types.LossTerms`.
-        max_depth_m: what unit depth 1 stands for.
+        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
         optimizer: makes an optimiser from named parameters.
-        scheduler: makes a learning-rate schedule from an optimiser and the total number of steps: a
+        scheduler: makes a learning-rate schedule from an optimiser and the total number of steps. A
             :class:`hudepth.training.schedules.StepSchedule` advances after every step, others after every epoch. None
             for a constant rate.
-        distill: distance from a teacher's depths, added to the loss of training batches that bring some.
-        record: what each checkpoint carries beside the weights: ``config`` and ``split``, plain types only.
+        distill: distance from a teacher's depths, added to the loss of training batches that have them.
+        record: stored in each checkpoint in addition to the weights, for example ``config``; plain types only.
     """
 
     def __init__(
@@ -91,8 +96,8 @@ class DepthModule(LightningModule):
         total = self._step(batch, "train")
         emptied = batch["emptied"] if "emptied" in batch else torch.zeros_like(total, dtype=torch.bool)
         self._unchecked.append(_Step(batch_idx, batch["index"], total.detach(), emptied))
-        if len(self._unchecked) >= LOTS.get(total.device.type, 50):
-            self._check_pending()
+        if len(self._unchecked) >= CHECK_EVERY.get(total.device.type, 50):
+            self._check_losses()
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -101,17 +106,18 @@ class DepthModule(LightningModule):
 
     @torch.inference_mode()
     def logged_names(self) -> list[str]:
-        """Return the names of all that is logged for an epoch; the loss is asked for its terms."""
+        """Return the names of everything that is logged for an epoch; calls the loss to learn its terms."""
         depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
         terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
         return [
-            *(f"val/{name}" for name in (*METRIC_NAMES, "ssim", *terms)),
-            *(f"train/{name}" for name in (*terms, *(["distill"] if self.distill else []))),
+            *(f"val/{name}" for name in (*METRIC_NAMES, "ssim")),
+            *(loss_name("val", term) for term in terms),
+            *(loss_name("train", term) for term in (*terms, *(["distill"] if self.distill else []))),
         ]
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         pred = self(batch.get("small_image", batch["image"]))
-        if pred.shape != batch["unit_depth"].shape:  # scored against the truth at full size, whatever size it trains at
+        if pred.shape != batch["unit_depth"].shape:  # the loss is computed at full size, whatever size it trains at
             pred = functional.interpolate(pred, batch["unit_depth"].shape[-2:], mode="bilinear", align_corners=False)
         loss = self.loss(pred, batch["unit_depth"], batch["image"], batch["valid"])
         total: Tensor = loss.total
@@ -119,9 +125,9 @@ class DepthModule(LightningModule):
         if self.distill is not None and "teacher" in batch:
             terms["distill"] = self.distill(pred, batch["teacher"])
             total = total + self.distill.weight * terms["distill"]
-        values = {f"{stage}/total": total.detach(), **{f"{stage}/{k}": v.detach() for k, v in terms.items()}}
-        # The batch size as a float: over processes Lightning averages the count of images in the count's own type, and
-        # of 7 images in two processes it would make 3 a process, which is a loss too high by a sixth.
+        values = {loss_name(stage, term): value.detach() for term, value in {"total": total, **terms}.items()}
+        # A float: Lightning averages the number of images over processes in the number's own type. From 7 images in two
+        # processes it would make 3 per process, and a loss too high by a sixth.
         size: Any = float(len(pred))
         self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True, batch_size=size)
         if stage == "val":
@@ -135,8 +141,8 @@ class DepthModule(LightningModule):
         self.val_metrics.reset()
 
     def on_train_epoch_end(self) -> None:
-        """Check the losses that were not looked at yet, and what the last step left, before anything is saved."""
-        self._check_pending()
+        """Check the remaining losses and the weights, before anything is saved."""
+        self._check_losses()
         self._check_emptied()
         finite = torch.stack([parameter.detach().isfinite().all() for parameter in self.net.parameters()]).all()
         if not bool(finite):
@@ -145,8 +151,8 @@ class DepthModule(LightningModule):
                 f"{self._last_good()} Lower optim.lr, or train with trainer.precision=32-true."
             )
 
-    def _check_pending(self) -> None:
-        """Look at the losses of the steps that were not looked at yet."""
+    def _check_losses(self) -> None:
+        """Check the losses of the steps that were not checked yet."""
         pending = list(self._unchecked)
         self._unchecked.clear()
         bad = [~step.total.isfinite() | step.emptied for step in pending]
@@ -161,7 +167,7 @@ class DepthModule(LightningModule):
         self._emptied += [step for step in pending if bool(step.emptied)]
 
     def _check_emptied(self) -> None:
-        """Stop if augmentation leaves most batches without truth; one of few measured pixels may lose them."""
+        """Stop if augmentation leaves most batches without ground truth; single batches may lose it."""
         emptied, batches = self._emptied, int(self.trainer.num_training_batches)
         self._emptied = []
         if 2 * len(emptied) > batches:
@@ -178,7 +184,7 @@ class DepthModule(LightningModule):
         return f"in epoch {self.current_epoch + 1}, batch {step.batch_idx} (step {number}), of the pairs {names}"
 
     def _last_good(self) -> str:
-        """Tell where the last checkpoint is: it was written before anything became NaN."""
+        """Name the last checkpoint, which was written before anything became NaN."""
         paths = [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]
         if not paths:
             return "No epoch was finished, so there is no checkpoint."
@@ -189,13 +195,13 @@ class DepthModule(LightningModule):
         optimizer = self._make_optimizer(self.net.named_parameters())
         if self._make_scheduler is None:
             return optimizer
-        steps = self.trainer.estimated_stepping_batches  # infinite if nothing says how long the training is
+        steps = self.trainer.estimated_stepping_batches  # infinite if the training has no end
         scheduler = self._make_scheduler(optimizer, int(steps) if math.isfinite(steps) else 0)
         interval = "step" if isinstance(scheduler, StepSchedule) else "epoch"
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
 
     def on_train_start(self) -> None:
-        """Refuse to go on with a schedule that was laid out over another number of steps."""
+        """Refuse to resume with a schedule that was laid out over another number of steps."""
         scheduler = self.lr_schedulers() if self._make_scheduler else None
         steps = self.trainer.estimated_stepping_batches
         if isinstance(scheduler, StepSchedule) and scheduler.total_steps != steps:
@@ -206,10 +212,7 @@ class DepthModule(LightningModule):
             )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the configuration and the split, so that a checkpoint needs nothing beside it.
-
-        If weights are averaged, a checkpoint holds the average.
-        """
+        """Add the configuration and the split, and averaged weights in place of the trained ones if there are any."""
         averaged = averaged_state(self._trainer, checkpoint)
         if averaged is not None:
             checkpoint["state_dict"] = averaged

@@ -1,4 +1,4 @@
-"""Learning-rate schedules that know how long a training is, and change the rate after every step."""
+"""Learning-rate schedules over the whole training that change the rate after every step."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hudepth.base.errors import ConfigError
 
 
 class StepSchedule(LambdaLR):
-    """A factor of each group's learning rate, as a function of how much of the training is done.
+    """Multiplies the learning rate of each group by a function of the finished share of the training.
 
     Args:
         optimizer: whose rates are changed.
         total_steps: of the whole training.
-        warmup: share of the training in which the factor rises evenly from 0 to 1, in [0, 1).
+        warmup: share of the training in which the factor rises linearly from 0 to 1, in [0, 1).
 
     Raises:
         ConfigError: if ``warmup`` is out of range, or the training has no end.
@@ -29,8 +29,8 @@ class StepSchedule(LambdaLR):
             raise ConfigError(f"schedule.warmup: {warmup} is not a share of the training, in [0, 1).")
         if total_steps < 1:
             raise ConfigError(
-                "schedule: one that ends with the training must know how long that is. Pass trainer.max_epochs or "
-                "+trainer.max_steps, or schedule=constant."
+                "schedule: the length of the training is not set. Pass trainer.max_epochs or +trainer.max_steps, or "
+                "schedule=constant."
             )
         self.total_steps, self.warmup = total_steps, warmup
         super().__init__(optimizer, partial(self._factor))
@@ -43,15 +43,11 @@ class StepSchedule(LambdaLR):
 
     @abstractmethod
     def factor(self, done: float) -> float:
-        """Return the factor after the warm-up.
-
-        Args:
-            done: share of what follows the warm-up, in [0, 1].
-        """
+        """Return the factor at a share ``done``, in [0, 1], of what follows the warm-up."""
 
 
 class WarmupCosine(StepSchedule):
-    """Up evenly, then down along half a cosine: one cycle (Smith 2018, with the cosine of Loshchilov and Hutter 2017).
+    """Linear warm-up, then half a cosine down: one cycle (Smith 2018, with the cosine of Loshchilov and Hutter 2017).
 
     Args:
         optimizer: whose rates are changed.

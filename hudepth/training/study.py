@@ -1,4 +1,4 @@
-"""The part of a search that runs inside a training: it tells how each epoch went, and may stop it."""
+"""The optuna study of a search, and the callback that reports each epoch to it and may prune the training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TRIAL_ENV = "HUDEPTH_TRIAL"
 
 
 class TrialPruner(Callback):
-    """Reports the monitored metric of each epoch to an optuna study, and ends the training if the study says so.
+    """Reports the monitored metric of each epoch to an optuna study, and stops the training if the study prunes it.
 
     Args:
         trial: the value of :data:`hudepth.training.study.TRIAL_ENV`.
@@ -40,33 +40,29 @@ class TrialPruner(Callback):
         self.monitor = monitor
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Report, and stop if others were better at this epoch.
-
-        Raises:
-            Pruned: to stop.
-        """
+        """Report, and raise :class:`hudepth.base.errors.Pruned` if other trials were better at this epoch."""
         value = epoch_metrics(trainer).get(self.monitor)
         epoch = trainer.current_epoch + 1
         if value is None or not trainer.is_global_zero:
             return
-        if epoch not in self._reported:  # a resumed run may come through an epoch again
+        if epoch not in self._reported:  # a resumed run may repeat an epoch
             self._trial.report(value, epoch)
         if self._trial.should_prune():
-            raise Pruned(f"pruned after epoch {epoch}: {self.monitor} {value:.4f} is worse than others' then", value)
+            raise Pruned(f"pruned after epoch {epoch}: {self.monitor} {value:.4f} is worse than in other trials", value)
 
 
 def open_study(
     file: str, options: Mapping[str, Any] | None = None, *, direction: str = "minimize"
 ) -> optuna.study.Study:
-    """Open the study in a file that many processes may write to and a kill cannot damage; make it if there is none.
+    """Open or create a study in a journal file, which many processes may write to and a kill cannot damage.
 
     Args:
         file: its path.
-        options: of the search, which are kept in the study; None: those that are.
+        options: of the search, to be stored in the study; None for those that are stored.
         direction: ``minimize`` or ``maximize``.
 
     Raises:
-        ConfigError: if optuna is not installed, or the file is none of its own.
+        ConfigError: if optuna is not installed, or the file is not a study.
     """
     optuna_ = import_optuna()
     from optuna.storages import JournalStorage
@@ -74,7 +70,7 @@ def open_study(
 
     logging.getLogger("optuna").setLevel(logging.WARNING)
     try:
-        if Path(file).is_file():  # optuna would add to any file
+        if Path(file).is_file():  # optuna would append to any file
             with Path(file).open(encoding="utf-8") as lines:
                 json.loads(next(lines, "{}"))
         storage = JournalStorage(JournalFileBackend(file, lock_obj=JournalFileOpenLock(file)))
@@ -84,11 +80,11 @@ def open_study(
         if options is not None:
             study.set_user_attr("options", dict(options))
         chosen = study.user_attrs["options"]
-        # another seed for each trial: a study that goes on should not draw again what it drew at first
+        # another seed after each trial: a resumed study should not repeat its first draws
         seed = int(chosen["seed"]) + len(study.get_trials(deepcopy=False))
     except Exception as error:
         why = " ".join(str(error).split())
-        raise ConfigError(f"search: '{file}' is no study that can go on ({why}). Pass another sweep_dir.") from error
+        raise ConfigError(f"search: '{file}' cannot be resumed as a study ({why}). Pass another sweep_dir.") from error
     pruners, samplers = optuna_.pruners, optuna_.samplers
     startup, warmup = chosen["startup_trials"], chosen["warmup_epochs"]
     study.pruner = pruners.MedianPruner(startup, warmup) if chosen["prune"] else pruners.NopPruner()

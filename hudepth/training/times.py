@@ -1,4 +1,4 @@
-"""What each epoch cost: times.csv of a run directory."""
+"""times.csv of a run directory: the time each epoch took."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COLUMNS = ("epoch", "height", "width", "images", "wall_s", "cpu_s", "lr")
 
 
 class Times(Callback):
-    """Writes times.csv: one row an epoch, sums since training began.
+    """Writes times.csv: one row per epoch, sums since training began.
 
     =========  ==========================================================================================
     column     meaning
@@ -25,13 +25,13 @@ class Times(Callback):
     epoch      from 1
     height     of training images [pixels]
     width      of training images [pixels]
-    images     training images seen so far, by all processes
-    wall_s     time since the start, validation, pictures and checkpoints included [s]
-    cpu_s      time of all cores in this process since the start; loader processes are not counted [s]
-    lr         learning rate of the optimiser's last group at the epoch's end
+    images     training images so far, in all processes
+    wall_s     time since the start, with validation, pictures and checkpoints [s]
+    cpu_s      time of all cores in this process since the start, without loader processes [s]
+    lr         learning rate of the optimiser's last group at the end of the epoch
     =========  ==========================================================================================
 
-    Times differ from run to run, so they are no part of the checkpoint: a run that goes on adds to the rows it finds.
+    Times differ from run to run, so checkpoints do not hold them: a resumed run appends to the rows it finds.
 
     Args:
         path: the file to write.
@@ -44,7 +44,7 @@ class Times(Callback):
         self._images = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Begin, or go on after the rows of the epochs that are done."""
+        """Start the clocks, after the rows of finished epochs if the run is resumed."""
         self.rows = [row for row in read_times(self.path) if int(row["epoch"]) <= trainer.current_epoch]
         last = self.rows[-1] if self.rows else {"wall_s": "0", "cpu_s": "0", "images": "0"}
         self._images = int(last["images"])
@@ -76,15 +76,15 @@ class Times(Callback):
 
 
 def read_times(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a times.csv that are whole; none if it is missing or of another form."""
+    """Return the complete rows of a times.csv; none if it is missing or damaged."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return [row for row in csv.DictReader(file) if _is_whole(row)]
+            return [row for row in csv.DictReader(file) if _is_complete(row)]
     except (OSError, ValueError):
         return []
 
 
-def _is_whole(row: dict[str, str]) -> bool:
+def _is_complete(row: dict[str, str]) -> bool:
     try:
         _ = [float(row[name]) for name in COLUMNS], int(row["epoch"]), int(row["images"])
     except (ValueError, KeyError, TypeError):

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from hudepth import cli
 from hudepth.base import verbs
-from hudepth.sweep.jobs import Job, combine
+from hudepth.sweep.jobs import Job, combine, merge_overrides
 from hudepth.sweep.jobs import compose as compose_jobs
 
 CONF = verbs.conf_folder()
@@ -82,7 +82,7 @@ def jobs_of(name: str, *typed: str) -> list[Job]:
     sweeper = yaml.safe_load((CONF / "sweep" / f"{name}.yaml").read_text())["hydra"]["sweeper"]
     parser = OverridesParser.create()
     params = parser.parse_overrides([f"{key}={values}" for key, values in sweeper.get("params", {}).items()])
-    jobs = combine(parser.parse_overrides(list(typed)), params, sweeper.get("variants", {}))
+    jobs = combine(merge_overrides(parser.parse_overrides(list(typed)), params), sweeper.get("variants", {}))
     return compose_jobs(jobs, lambda overrides: composed(f"+sweep={name}", *overrides), str)
 
 

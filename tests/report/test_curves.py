@@ -20,9 +20,9 @@ def history(epochs: int, *, names: tuple[str, ...] = TERMS, val_every: int = 1) 
     for epoch in range(1, epochs + 1):
         row = {"epoch": float(epoch), "step": 10.0 * epoch, "val/abs_rel": 0.3}
         for factor, name in enumerate(names, start=1):
-            row[f"train/{name}"] = factor / epoch
+            row[f"train/loss/{name}"] = factor / epoch
             if epoch % val_every == 0:
-                row[f"val/{name}"] = 1.2 * factor / epoch
+                row[f"val/loss/{name}"] = 1.2 * factor / epoch
         rows.append(row)
     return rows
 
@@ -87,18 +87,20 @@ def test_losses_start_at_zero() -> None:
 
 
 def test_no_training_loss() -> None:
-    with pytest.raises(DataError, match=r"train/total"):
+    with pytest.raises(DataError, match=r"train/loss/total"):
         draw_curves([{"epoch": 1.0, "val/abs_rel": 0.2}])
 
 
 def test_history_is_read_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
-    path.write_text("epoch,step,train/total,val/total\n1,10,0.1,\n2,20,0.05,0.30000000000000004\n3,30,nan,inf\n")
+    path.write_text(
+        "epoch,step,train/loss/total,val/loss/total\n1,10,0.1,\n2,20,0.05,0.30000000000000004\n3,30,nan,inf\n"
+    )
     first, second, third = read_history(path)
-    assert first == {"epoch": 1, "step": 10, "train/total": 0.1}
-    assert second == {"epoch": 2, "step": 20, "train/total": 0.05, "val/total": 0.1 + 0.2}
-    assert np.isnan(third["train/total"])
-    assert third["val/total"] == float("inf")
+    assert first == {"epoch": 1, "step": 10, "train/loss/total": 0.1}
+    assert second == {"epoch": 2, "step": 20, "train/loss/total": 0.05, "val/loss/total": 0.1 + 0.2}
+    assert np.isnan(third["train/loss/total"])
+    assert third["val/loss/total"] == float("inf")
 
 
 @pytest.mark.parametrize(
@@ -106,9 +108,9 @@ def test_history_is_read_as_it_was_written(tmp_path: Path) -> None:
     [
         (None, "No such file"),
         ("", "epoch"),
-        ("epoch,train/total\n", "epoch"),
+        ("epoch,train/loss/total\n", "epoch"),
         ("epoch\nmany\n", "'many'"),
-        ("train/total\n0.1\n", "without an epoch"),
+        ("train/loss/total\n0.1\n", "without an epoch"),
     ],
 )
 def test_no_history(tmp_path: Path, content: str | None, why: str) -> None:
@@ -119,7 +121,7 @@ def test_no_history(tmp_path: Path, content: str | None, why: str) -> None:
         read_history(path)
 
 
-@pytest.mark.parametrize("content", [b"epoch,train/total\n1,0.1,7\n", b"\xff\xfe\x00", b"epoch\n1\x00\n"])
+@pytest.mark.parametrize("content", [b"epoch,train/loss/total\n1,0.1,7\n", b"\xff\xfe\x00", b"epoch\n1\x00\n"])
 def test_damaged_history_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "metrics.csv"
     path.write_bytes(content)
@@ -130,7 +132,8 @@ def test_damaged_history_is_one_line(tmp_path: Path, content: bytes) -> None:
 
 def test_a_metric_is_not_drawn_as_the_loss_of_its_name() -> None:
     rows = [
-        {"epoch": e, "train/total": 1.0, "val/total": 1.0, "train/silog": 2.0, "val/silog": 20.0} for e in (1.0, 2.0)
+        {"epoch": e, "train/loss/total": 1.0, "val/loss/total": 1.0, "train/loss/silog": 2.0, "val/silog": 20.0}
+        for e in (1.0, 2.0)
     ]
     total, silog = draw_curves(rows).axes
     assert len(total.lines) == 2

@@ -27,7 +27,8 @@ from hudepth.data.sources.rooms import RoomsSource
 from hudepth.losses import BADCL
 from hudepth.models import HybridUNet, TinyUNet
 from hudepth.runs.checkpoint import KEY, VERSION, AtomicCheckpointIO, find_checkpoint, load_checkpoint, read_plain
-from hudepth.training.callbacks import History, checkpoint_callbacks
+from hudepth.training.callbacks import History
+from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 
 MODEL = {"_target_": "hudepth.models.TinyUNet", "channels": 4}

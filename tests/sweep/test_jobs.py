@@ -7,14 +7,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.sweep.jobs import Job, combine
+from hudepth.sweep.jobs import Job, combine, merge_overrides
 
 VARIANTS = {"paper": [], "l1": ["loss=l1"], "l2": ["loss=l2", "seed=5"]}
 
 
 def jobs(*typed: str, params: tuple[str, ...] = (), variants: dict[str, list[str]] | None = None) -> list[Job]:
     parse = OverridesParser.create().parse_overrides
-    return combine(parse(list(typed)), parse(list(params)), variants or {})
+    return combine(merge_overrides(parse(list(typed)), parse(list(params))), variants or {})
 
 
 def test_every_combination_once_seeds_last() -> None:

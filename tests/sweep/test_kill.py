@@ -101,7 +101,7 @@ def test_ctrl_c_ends_between_two_batches_and_says_how_to_go_on(tmp_path: Path, c
     assert process.returncode == 130, out
     assert "stopping after this batch; Ctrl-C again stops at once" in out
     assert re.search(r"^sweep tried: 0 finished, 2 unfinished; in ", out, re.MULTILINE)
-    assert "to go on: hudepth-train -m model=tiny" in out
+    assert "to resume: hudepth-train -m model=tiny" in out
     assert "Traceback" not in out
     (begun,) = tmp_path.glob("s/*/status.json")
     assert json.loads(begun.read_text())["state"] == "interrupted"

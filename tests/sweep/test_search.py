@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from unittest.mock import create_autospec
@@ -16,8 +17,9 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from optuna.trial import TrialState
 
 from hudepth.base.errors import ConfigError, Pruned
+from hudepth.base.options import parse
 from hudepth.base.verbs import conf_folder
-from hudepth.sweep.search import check_options, distribution
+from hudepth.sweep.search import SearchOptions, distribution
 from hudepth.training.study import TrialPruner, open_study
 from tests.commands import Command, script
 
@@ -62,17 +64,20 @@ def test_what_cannot_be_drawn_from(text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "key", "word"),
     [
-        ({"trial": 3}, "hydra.sweeper.search: no 'trial'. Did you mean 'trials'? It takes trials, sampler, "),
-        ({"trials": 0}, "trials: 0 is no whole number of at least 1."),
-        ({"sampler": "grid"}, "hydra.sweeper.search.sampler: no 'grid'. Pass tpe or random."),
+        ({"trial": 3}, "trial", "'trials'"),
+        ({"trials": 0}, "trials", "at least 1"),
+        ({"sampler": "grid"}, "sampler", "tpe"),
     ],
 )
-def test_options_are_checked(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        check_options({**OPTIONS, "trials": 1, **options})
-    assert str(caught.value).startswith(message)
+def test_options_are_checked(options: dict[str, Any], key: str, word: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^hydra\.sweeper\.search\.{key}: .*{word}"):
+        parse(SearchOptions, {**OPTIONS, **options}, prefix="hydra.sweeper.search.", strict=True)
+
+
+def test_the_defaults_are_those_of_the_configuration() -> None:
+    assert asdict(SearchOptions()) == OPTIONS
 
 
 def ended(epoch: int, value: float) -> Any:
@@ -94,7 +99,7 @@ def test_a_trial_worse_than_the_median_of_the_others_is_ended(tmp_path: Path) ->
     good, bad = (TrialPruner(f"{study.ask().number}:{file}", monitor="val/abs_rel") for _ in range(2))
     good.on_train_epoch_end(ended(0, 0.21), module)
     with pytest.raises(
-        Pruned, match=r"^pruned after epoch 1: val/abs_rel 0\.9000 is worse than others' then$"
+        Pruned, match=r"^pruned after epoch 1: val/abs_rel 0\.9000 is worse than in other trials$"
     ) as caught:
         bad.on_train_epoch_end(ended(0, 0.9), module)
     assert caught.value.value == pytest.approx(0.9)

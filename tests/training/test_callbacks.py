@@ -30,7 +30,8 @@ from hudepth.models import TinyUNet
 from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
 from hudepth.runs.history import read_history
 from hudepth.training import callbacks
-from hudepth.training.callbacks import EpochLine, History, Interrupt, PanelPictures, checkpoint_callbacks
+from hudepth.training.callbacks import EpochLine, History, Interrupt, PanelPictures
+from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 from hudepth.viz.panels import Panel
 
@@ -93,7 +94,7 @@ def test_history_has_one_row_an_epoch(data: DepthDataModule, tmp_path: Path) -> 
     rows = read_history(tmp_path / "metrics.csv")
     assert [row["epoch"] for row in rows] == [1, 2, 3]
     assert [row["step"] for row in rows] == [3, 6, 9]  # 8 training pairs in batches of 3
-    assert {"train/total", "val/total", "val/abs_rel", "val/ssim"} <= set(rows[0])
+    assert {"train/loss/total", "val/loss/total", "val/abs_rel", "val/ssim"} <= set(rows[0])
     assert all(set(row) == set(rows[0]) for row in rows)
     for name, value in trainer.callback_metrics.items():
         assert rows[-1][name] == value.item()  # written with all digits
@@ -139,11 +140,11 @@ def test_an_epoch_without_validation_has_no_validation_metrics(data: DepthDataMo
     fit(data, tmp_path, max_epochs=4, check_val_every_n_epoch=2)
     rows = read_history(tmp_path / "metrics.csv")
     assert ["val/abs_rel" in row for row in rows] == [False, True, False, True]
-    assert all("train/total" in row for row in rows)
+    assert all("train/loss/total" in row for row in rows)
     assert rows[1]["val/abs_rel"] != rows[3]["val/abs_rel"]
 
 
-# --- one line an epoch ------------------------------------------------------------------------------------------
+# --- one line per epoch ------------------------------------------------------------------------------------------
 
 
 def test_epoch_line(data: DepthDataModule, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -156,17 +157,29 @@ def test_epoch_line(data: DepthDataModule, tmp_path: Path, caplog: pytest.LogCap
         log.propagate = propagate
     lines = [record.message for record in caplog.records if record.message.startswith("epoch")]
     rows = read_history(tmp_path / "metrics.csv")
-    shown = ("train/total", "val/total", "val/silog", "val/abs_rel", "val/rmse", "val/delta1")
+    shown = ("train/loss/total", "val/loss/total", "val/silog", "val/abs_rel", "val/rmse", "val/delta1")
     for number, (line, row) in enumerate(zip(lines, rows, strict=True), start=1):
         values = ", ".join(f"{name} {row[name]:.4f}" for name in shown)
-        assert line.startswith(f"epoch {number} of 2: {values} (0 s an epoch")
+        assert line.startswith(f"epoch {number} of 2: {values} (0 s per epoch")
     assert lines[0].endswith(" left)")
-    assert lines[1].endswith(" an epoch)")
+    assert lines[1].endswith(" per epoch)")
 
 
 def test_the_monitored_metric_is_shown_once() -> None:
-    assert EpochLine("val/rmse").shown == ("train/total", "val/total", "val/rmse", "val/abs_rel", "val/delta1")
-    assert EpochLine("train/total").shown == ("train/total", "val/total", "val/abs_rel", "val/rmse", "val/delta1")
+    assert EpochLine("val/rmse").shown == (
+        "train/loss/total",
+        "val/loss/total",
+        "val/rmse",
+        "val/abs_rel",
+        "val/delta1",
+    )
+    assert EpochLine("train/loss/total").shown == (
+        "train/loss/total",
+        "val/loss/total",
+        "val/abs_rel",
+        "val/rmse",
+        "val/delta1",
+    )
 
 
 # --- Ctrl-C ---

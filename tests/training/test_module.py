@@ -59,7 +59,7 @@ def make_trainer(*callbacks: Callback, **options: Any) -> Trainer:
 def test_what_is_logged(cache: Path) -> None:
     module, trainer = make_module(), make_trainer()
     trainer.fit(module, datamodule=make_data(cache))
-    losses = {f"{stage}/{name}" for stage in ("train", "val") for name in ("total", *BADCL().weights)}
+    losses = {f"{stage}/loss/{name}" for stage in ("train", "val") for name in ("total", *BADCL().weights)}
     assert set(trainer.callback_metrics) == losses | {f"val/{name}" for name in (*METRIC_NAMES, "ssim")}
     assert {*METRIC_NAMES, "ssim"} >= SECTION_3_5
     assert all(value.isfinite() for value in trainer.callback_metrics.values())
@@ -129,7 +129,7 @@ def test_training_loss_is_the_mean_over_images(cache: Path) -> None:
     sizes = [min(3, n - start) for start in range(0, n, 3)]
     assert len(set(sizes)) == 2
     expected = sum(total * size for total, size in zip(spy.totals, sizes, strict=True)) / n
-    assert trainer.callback_metrics["train/total"].item() == pytest.approx(expected, rel=1e-6)
+    assert trainer.callback_metrics["train/loss/total"].item() == pytest.approx(expected, rel=1e-6)
 
 
 def test_raw_terms_are_logged_apart_from_their_weights(cache: Path) -> None:
@@ -241,7 +241,7 @@ def test_a_bad_validation_loss_does_not_stop_training(cache: Path) -> None:
     module = make_module(PoisonedLoss(good_calls=3, value=float("inf")))  # 3 batches of training, then validation
     trainer = make_trainer()
     trainer.fit(module, datamodule=make_data(cache))
-    assert trainer.callback_metrics["val/total"].item() == float("inf")
+    assert trainer.callback_metrics["val/loss/total"].item() == float("inf")
 
 
 def test_bf16_mixed(cache: Path) -> None:

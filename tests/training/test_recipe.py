@@ -146,10 +146,7 @@ def test_a_training_without_a_number_of_epochs(schedule: str, command: Command) 
     if schedule == "step":
         assert done.code == 0, done.err
         return
-    assert last_line(done.err) == (
-        "hudepth-train: schedule: one that ends with the training must know how long that is. Pass trainer.max_epochs "
-        "or +trainer.max_steps, or schedule=constant."
-    )
+    assert "schedule: the length of the training is not set. Pass trainer.max_epochs" in last_line(done.err)
 
 
 def test_a_schedule_is_not_stretched_when_a_run_goes_on(command: Command, tmp_path: Path) -> None:
@@ -320,12 +317,12 @@ def test_a_teacher_that_is_the_truth_is_as_far_away_as_the_truth(
     assert done.code == 0, done.err
     for row in rows(only_run(tmp_path, "taught"), "metrics.csv"):
         terms = {
-            name: float(row[f"train/{name}"]) for name in ("total", "boundary", "smoothness", "scaling", "distill")
+            name: float(row[f"train/loss/{name}"]) for name in ("total", "boundary", "smoothness", "scaling", "distill")
         }
         assert terms["distill"] > 0.01
         whole = 3 * terms["boundary"] + 1.2 * terms["smoothness"] + terms["scaling"] + 0.5 * terms["distill"]
         assert terms["total"] == pytest.approx(whole, rel=1e-5)
-        assert "val/distill" not in row
+        assert "val/loss/distill" not in row
 
 
 def test_a_teacher_that_lacks_depths_is_refused(teacher: Path, command: Command) -> None:

@@ -97,7 +97,9 @@ def test_splits_are_compared_within_one_recipe_and_protocol(make_run: MakeRun) -
 @pytest.mark.parametrize(("ssim", "verdict"), [(0.9, "contradicted"), (0.9981, "measured")])
 def test_misread_units_are_told_by_ssim(make_run: MakeRun, ssim: float, verdict: str) -> None:
     def history(last: int, value: float) -> list[dict[str, float]]:
-        return [{"epoch": e, "val/ssim": value, "val/total": 0.1 / e, "val/abs_rel": 0.2} for e in range(1, last + 1)]
+        return [
+            {"epoch": e, "val/ssim": value, "val/loss/total": 0.1 / e, "val/abs_rel": 0.2} for e in range(1, last + 1)
+        ]
 
     right = read_run(make_run("right", history=history(4, ssim)))
     misread = read_run(make_run("misread", config={"data.encoding": "paper_literal"}, history=history(2, 0.9977)))

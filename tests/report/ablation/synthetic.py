@@ -82,7 +82,7 @@ def make_run(
     rows = [
         f"{e},{10 * e},{1 / e:.4f},{0.3 + seed / 100 + 0.2 / e:.4f},{0.8 - 0.2 / e:.4f}" for e in range(1, epochs + 1)
     ]
-    (path / "metrics.csv").write_text("\n".join(["epoch,step,train/total,val/abs_rel,val/delta1", *rows, ""]))
+    (path / "metrics.csv").write_text("\n".join(["epoch,step,train/loss/total,val/abs_rel,val/delta1", *rows, ""]))
     if table is not None:
         write_test(path / "test" / "eigen", table, changes=document)
     return path

@@ -1,0 +1,91 @@
+"""The options of hudepth-train that are not parts to build, checked before anything is prepared or written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+import torch
+
+from hudepth.base.devices import check_devices
+from hudepth.base.errors import ConfigError
+from hudepth.base.options import Range, parse
+
+MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
+
+
+@dataclass(frozen=True)
+class TrainerOptions:
+    """Arguments of ``lightning.Trainer`` with a type of their own; Lightning checks the others."""
+
+    accelerator: str = "auto"
+    num_nodes: Annotated[int, Range(1)] = 1
+    precision: str = "32-true"
+    max_epochs: Annotated[int, Range(-1)] | None = None
+    accumulate_grad_batches: Annotated[int, Range(1)] = 1
+    gradient_clip_val: Annotated[float, Range(0)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.precision.endswith("16-true"):
+            raise ConfigError(
+                f"trainer.precision: {self.precision} keeps the weights in 16 bits, which loses updates. "
+                "Pass bf16-mixed, 16-mixed or 32-true."
+            )
+
+
+@dataclass(frozen=True)
+class CallbackOptions:
+    """Pictures, early stopping and further callbacks."""
+
+    panels: Annotated[int, Range(0)] = 6
+    panels_every_n_epochs: Annotated[int, Range(1)] = 1
+    early_stopping: dict[str, Any] | None = None
+    extra: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class LoggerOptions:
+    """Loggers in addition to metrics.csv."""
+
+    tensorboard: bool = True
+    extra: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of a training. Those with a default are missing from the configurations of some old runs."""
+
+    name: str
+    seed: Annotated[int, Range(0, 2**32 - 1)]
+    monitor: str
+    mode: Literal["min", "max"]
+    trainer: TrainerOptions
+    callbacks: CallbackOptions
+    logger: LoggerOptions
+    test: bool
+    trust: list[str]
+    baselines: bool = True
+    init: str | None = None
+    memory_format: Literal["contiguous", "channels_last"] = "contiguous"
+    compile: bool = False
+    variant: str | None = None
+    sweep_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", self.name) or ".." in self.name.split("/"):
+            raise ConfigError(f"name: '{self.name}' cannot name a folder. Use letters, digits, '.', '_' and '-'.")
+
+
+def parse_options(config: Mapping[str, Any]) -> TrainOptions:
+    """Check the options of a configuration.
+
+    Raises:
+        ConfigError: for values of the wrong type or out of range, and for devices that are missing.
+    """
+    options = parse(TrainOptions, config)
+    if options.compile and config["model"].get("recompute"):
+        raise ConfigError("compile: torch.compile does not support model.recompute. Set one of them to false.")
+    check_devices(config["trainer"])
+    return options
