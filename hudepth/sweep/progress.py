@@ -81,9 +81,8 @@ class _Watched:
         self.path, self.monitor = path, monitor
         config: Any = job.config
         self.epochs = int(config["trainer"].get("max_epochs") or 0)
-        self._stamps = {name: self._stamp(name) for name in (history.FILE, "status.json")}
         self._seen, self._metric = self._last_epoch()
-        self._first = self._seen
+        self._first, self._status = self._seen, read_status(path)
         self._began: float | None = None
         self._ended = False
 
@@ -99,30 +98,20 @@ class _Watched:
 
     def news(self) -> str:
         """Return what happened since the last call, or an empty string."""
-        if self._has_changed(history.FILE):
-            epoch, metric = self._last_epoch()
-            if epoch != self._seen:
-                self._seen, self._metric = epoch, metric
-                self._began = self._began or time.monotonic()
-                return f"epoch {epoch} of {self.epochs}{metric}" + _left(", ", self._began, self.done, self.left)
-        if self._has_changed("status.json"):
-            status = read_status(self.path)
-            self._ended = status.get("state") in (FINISHED, FAILED, PRUNED)
-            if self._ended:
-                took = f" in {duration(time.monotonic() - self._began)}" if self._began else ""
-                return f"{status['state']}{took}" + (f": {status['error']}" if status.get("error") else self._metric)
+        epoch, metric = self._last_epoch()
+        if epoch != self._seen:
+            self._seen, self._metric = epoch, metric
             self._began = self._began or time.monotonic()
+            return f"epoch {epoch} of {self.epochs}{metric}" + _left(", ", self._began, self.done, self.left)
+        status = read_status(self.path)
+        if status == self._status:
+            return ""
+        self._status, self._ended = status, status.get("state") in (FINISHED, FAILED, PRUNED)
+        if self._ended:
+            took = f" in {duration(time.monotonic() - self._began)}" if self._began else ""
+            return f"{status['state']}{took}" + (f": {status['error']}" if status.get("error") else self._metric)
+        self._began = self._began or time.monotonic()
         return ""
-
-    def _has_changed(self, name: str) -> bool:
-        before, self._stamps[name] = self._stamps[name], self._stamp(name)
-        return self._stamps[name] != before
-
-    def _stamp(self, name: str) -> int:
-        try:
-            return (self.path / name).stat().st_mtime_ns
-        except OSError:
-            return 0
 
     def _last_epoch(self) -> tuple[int, str]:
         """Return the last epoch of metrics.csv and the words for its metric."""

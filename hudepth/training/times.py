@@ -19,17 +19,9 @@ COLUMNS = ("epoch", "height", "width", "images", "wall_s", "cpu_s", "lr")
 class Times(Callback):
     """Writes times.csv: one row per epoch, sums since training began.
 
-    =========  ==========================================================================================
-    column     meaning
-    =========  ==========================================================================================
-    epoch      from 1
-    height     of training images [pixels]
-    width      of training images [pixels]
-    images     training images so far, in all processes
-    wall_s     time since the start, with validation, pictures and checkpoints [s]
-    cpu_s      time of all cores in this process since the start, without loader processes [s]
-    lr         learning rate of the optimiser's last group at the end of the epoch
-    =========  ==========================================================================================
+    Columns: ``epoch`` from 1; ``height`` and ``width`` of training images [pixels]; ``images``, training images so far
+    in all processes; ``wall_s``, time since the start with validation, pictures and checkpoints [s]; ``cpu_s``, time of
+    all cores in this process without loader processes [s]; ``lr``, learning rate of the optimiser's last group.
 
     Times differ from run to run, so checkpoints do not hold them: a resumed run appends to the rows it finds.
 

@@ -55,6 +55,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
+@pytest.mark.slow
 def test_a_sweep_that_is_killed_again_and_again_ends_with_the_same_table(
     launcher: str, undisturbed: Path, tmp_path: Path, cache: Path
 ) -> None:
@@ -78,6 +79,7 @@ def wait_for(condition: Any, *, seconds: float = 120) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_a_kill_loses_at_most_the_epoch_that_was_running(tmp_path: Path, cache: Path) -> None:
     arguments = ("-m", *FAST, "trainer.max_epochs=500", "loss=l1", "seed=1", "sweep_dir=s")
     process = start(tmp_path, cache, *arguments)
@@ -93,6 +95,7 @@ def test_a_kill_loses_at_most_the_epoch_that_was_running(tmp_path: Path, cache: 
     assert (run / "train.log").read_text().count(f"epoch {had - 1} of 500") == 1  # was not trained again
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_between_two_batches_and_says_how_to_go_on(tmp_path: Path, cache: Path) -> None:
     process = start(tmp_path, cache, "-m", *FAST, "trainer.max_epochs=5000", "loss=l1,l2", "sweep_dir=s")
     wait_for(lambda: list(tmp_path.glob("s/*/metrics.csv")))
@@ -107,6 +110,7 @@ def test_ctrl_c_ends_between_two_batches_and_says_how_to_go_on(tmp_path: Path, c
     assert json.loads(begun.read_text())["state"] == "interrupted"
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_costs_no_other_job(tmp_path: Path, cache: Path) -> None:
     """As when memory runs out: joblib gives up its whole pool, and what had not begun is launched anew."""
     epochs = ("trainer.max_epochs=300", "loss=l1,l2", "seed=1,2", "sweep_dir=s", "hydra/launcher=joblib")
@@ -123,6 +127,7 @@ def test_a_worker_that_is_killed_costs_no_other_job(tmp_path: Path, cache: Path)
 
 
 @pytest.mark.parametrize("launcher", ["submitit_local", "ray"])
+@pytest.mark.slow
 def test_jobs_of_a_cluster(launcher: str, tmp_path: Path, cache: Path) -> None:
     if launcher == "ray":
         pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="ray is large, and no part of the dev extra")

@@ -139,6 +139,7 @@ def test_a_search_ends_with_its_best_trials_and_can_be_given_more(command: Comma
     assert len({str(trial.params) for trial in again}) > 2  # it does not draw the same again
 
 
+@pytest.mark.slow
 def test_a_trial_that_fails_is_told_and_the_search_goes_on(command: Command, tmp_path: Path) -> None:
     done = searched(
         command, "optim.lr=choice(-1,1e-3)", "hydra.sweeper.search.trials=6", "hydra.sweeper.search.sampler=random"
@@ -169,6 +170,7 @@ def test_mistakes_in_a_search_give_one_line(command: Command, tmp_path: Path) ->
     assert (tmp_path / "odd" / "study.log").read_text() == "no study\n"
 
 
+@pytest.mark.slow
 def test_a_search_that_is_killed_goes_on_with_the_trial_it_was_at(tmp_path: Path, cache: Path) -> None:
     arguments = (
         "-m",

@@ -84,6 +84,7 @@ def test_lines_tell_what_each_job_does(command: Command, tmp_path: Path) -> None
     assert "paper protocol" in log
 
 
+@pytest.mark.slow
 def test_a_failing_job_stops_no_other_and_is_tried_again(command: Command, tmp_path: Path) -> None:
     done = sweep(command, "optim.lr=-1,1e-3")
     assert done.code == 1
@@ -113,6 +114,7 @@ def test_a_job_that_is_refused_before_it_starts_leaves_a_status_too(command: Com
     assert "Traceback" in (run / "train.log").read_text()
 
 
+@pytest.mark.slow
 def test_a_value_that_does_not_compose_stops_no_other(command: Command, tmp_path: Path) -> None:
     done = sweep(command, "loss=l1,l3")
     assert done.code == 1
@@ -137,6 +139,7 @@ def test_nothing_is_made_where_no_job_composes(command: Command, tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_foreign_and_half_written_folders_stay_as_they_are(command: Command, tmp_path: Path) -> None:
     folder = tmp_path / "s"
     for name, text in (
@@ -154,6 +157,7 @@ def test_foreign_and_half_written_folders_stay_as_they_are(command: Command, tmp
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.slow
 def test_a_run_is_known_by_its_configuration_and_not_by_its_name(command: Command, tmp_path: Path) -> None:
     assert sweep(command, "loss=l1,l2").code == 0
     run = runs(tmp_path / "s")["l1"]
@@ -165,6 +169,7 @@ def test_a_run_is_known_by_its_configuration_and_not_by_its_name(command: Comman
     assert runs(tmp_path / "moved")["l1"].name == "renamed"
 
 
+@pytest.mark.slow
 def test_another_protocol_tests_again_and_trains_no_more(command: Command, tmp_path: Path) -> None:
     assert sweep(command, "loss=l1,l2").code == 0
     before = {name: (run / "metrics.csv").read_bytes() for name, run in runs(tmp_path / "s").items()}
@@ -180,6 +185,7 @@ def test_another_protocol_tests_again_and_trains_no_more(command: Command, tmp_p
     assert "0 of 2 jobs to run" in sweep(command, "loss=l1,l2", "protocol=[paper,eigen]").err
 
 
+@pytest.mark.slow
 def test_variants_are_picked_and_seeds_change_last(command: Command, tmp_path: Path) -> None:
     arguments = ("+sweep=loss_terms", "model=tiny", *FAST[1:], "sweep_dir=s", "variant=l1,scaling", "seed=1,2")
     done = command("train", *arguments)
@@ -276,6 +282,7 @@ def test_two_commands_do_not_run_one_sweep(command: Command, tmp_path: Path) -> 
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_another_process_works_on_is_left_to_it(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,6 +301,7 @@ def test_a_run_that_another_process_works_on_is_left_to_it(
     assert status(run) == {"state": "running", "pid": 4711}
 
 
+@pytest.mark.slow
 def test_a_sweep_is_called_by_its_file_also_beside_an_experiment(command: Command, tmp_path: Path) -> None:
     fast = [word for word in FAST if not word.startswith("name=")]
     arguments = ("+sweep=loss_terms", "+experiment=demo", *fast, "variant=l1", "seed=1", "test=false")
@@ -304,6 +312,7 @@ def test_a_sweep_is_called_by_its_file_also_beside_an_experiment(command: Comman
     assert list(states(folder).values()) == ["finished"]
 
 
+@pytest.mark.slow
 def test_without_a_folder_there_is_a_dated_one(command: Command, tmp_path: Path) -> None:
     assert command("train", "-m", *FAST, "loss=l1", "test=false").code == 0
     (folder,) = (tmp_path / "sweeps" / "tried").iterdir()

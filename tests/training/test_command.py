@@ -121,6 +121,7 @@ def test_a_protocol_that_needs_what_is_not_prepared_is_refused_before_training(c
     assert "epoch 1" not in done.err
 
 
+@pytest.mark.slow
 def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
     done = command(
         "train", *TINY, "name=stop", "callbacks=early_stopping", "callbacks.panels=0", "schedule=cosine", "test=false",
@@ -199,6 +200,7 @@ RECIPE = (
 
 
 @pytest.mark.parametrize("recipe", [("schedule=cosine",), RECIPE], ids=["plain", "strong"])
+@pytest.mark.slow
 def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(
     recipe: tuple[str, ...], tmp_path: Path, cache: Path
 ) -> None:
@@ -248,6 +250,7 @@ def wait_for_epoch(process: subprocess.Popen[str], folder: Path, *, at_least: in
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path, cache: Path) -> None:
     process = subprocess.Popen(
         **script("train", *TINY, "name=killed", "trainer.max_epochs=1000", "test=false", cwd=tmp_path, cache=cache)
@@ -262,6 +265,7 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path, cache: Pat
     assert status(run)["state"] == "interrupted"
 
 
+@pytest.mark.slow
 def test_two_processes_train_into_one_run_directory(tmp_path: Path, cache: Path) -> None:
     """Distributed data parallel, on the CPU: one run, one row an epoch, tested once."""
     distributed = ["trainer.devices=2", "trainer.strategy=ddp"]
@@ -290,6 +294,7 @@ def test_a_run_directory_does_not_vouch_for_its_own_classes(command: Command, tr
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.slow
 def test_a_moved_run_keeps_its_best_when_it_goes_on(command: Command, tmp_path: Path) -> None:
     options = (*TINY, "test=false", "callbacks.panels=0", "logger=none", "monitor=train/loss/total", "mode=max")
     assert command("train", *options, "name=moving").code == 0  # mode=max: the first epoch is the best
@@ -325,6 +330,7 @@ def test_mistakes_are_found_before_any_work(override: str, message: str, command
     assert "epoch 1" not in done.err
 
 
+@pytest.mark.slow
 def test_a_cosine_schedule_has_its_end(command: Command, tmp_path: Path) -> None:
     assert command("train", *TINY, "name=cosine", "schedule=cosine", "test=false", "callbacks.panels=0").code == 0
     done = command("train", f"resume={only_run(tmp_path, 'cosine')}", "trainer.max_epochs=4")

@@ -84,6 +84,7 @@ def assert_same_metrics(one: Path, two: Path) -> None:
 
 @pytest.mark.parametrize("fractions", [SEVEN, THREE], ids=["7 to validate", "3 to validate"])
 @pytest.mark.usefixtures("no_norm")
+@pytest.mark.slow
 def test_two_processes_give_the_metrics_of_one(fractions: str, tmp_path: Path, cache: Path) -> None:
     """Each with half the batch: the same pairs a step, the same history, the same test."""
     options = (*NO_NORM, fractions)
@@ -92,6 +93,7 @@ def test_two_processes_give_the_metrics_of_one(fractions: str, tmp_path: Path, c
     assert_same_metrics(one, two)
 
 
+@pytest.mark.slow
 def test_a_run_of_two_processes_goes_on_as_if_never_stopped(tmp_path: Path, cache: Path) -> None:
     """With batch norm, whose statistics each process gathers by itself and all take from the first."""
     options = (SEVEN, *TWO, "test=false", "callbacks.panels=0", "logger=none")
@@ -105,6 +107,7 @@ def test_a_run_of_two_processes_goes_on_as_if_never_stopped(tmp_path: Path, cach
     assert all(bool((ours[name] == theirs[name]).all()) for name in ours)
 
 
+@pytest.mark.slow
 def test_two_processes_test_as_one_does(trained: Path, tmp_path: Path, cache: Path) -> None:
     """Not a digit differs: rows of images are gathered, and all is computed from them."""
     for name, more in (("test_one", ()), ("test_two", ("trainer.devices=2",))):
@@ -146,6 +149,7 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
+@pytest.mark.slow
 def test_processes_of_torchrun_share_one_run_and_have_its_history(no_norm: None, tmp_path: Path, cache: Path) -> None:
     options = (*TINY, *PAIRS, *NO_NORM, SEVEN, "test=false")
     alone = trained("alone", *NO_NORM, SEVEN, "data.batch_size=4", "test=false", folder=tmp_path, cache=cache)
@@ -161,6 +165,7 @@ def test_processes_of_torchrun_share_one_run_and_have_its_history(no_norm: None,
         assert ours == pytest.approx(theirs, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_two_machines_share_one_run(no_norm: None, tmp_path: Path, cache: Path) -> None:
     """Two launchers that know each other by address, as on two machines: here they are both this one."""
     options = (*TINY, *PAIRS, *NO_NORM, SEVEN, "name=machines", "protocol=paper", "baselines=false")
@@ -182,6 +187,7 @@ def test_two_machines_share_one_run(no_norm: None, tmp_path: Path, cache: Path) 
     assert (run / "test" / "paper" / "metrics.json").is_file()
 
 
+@pytest.mark.slow
 def test_launched_processes_must_be_as_many_as_asked_for(tmp_path: Path, cache: Path) -> None:
     process = torchrun(
         *TINY, "test=false", folder=tmp_path, cache=cache,

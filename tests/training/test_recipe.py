@@ -84,6 +84,7 @@ def test_a_progressive_resolution_that_cannot_be(progressive: str, message: str,
         ("callbacks.extra=[{_target_:hudepth.training.freezing.FreezeEncoder,until:0.5}]", "FreezeEncoder"),
     ],
 )
+@pytest.mark.slow
 def test_what_is_laid_out_over_the_epochs_keeps_their_number(
     option: str, what: str, command: Command, tmp_path: Path
 ) -> None:
@@ -136,6 +137,7 @@ def test_augmentation_that_leaves_nothing_stops_with_the_pairs(
 
 
 @pytest.mark.parametrize("schedule", ["step", "warmup_cosine"])
+@pytest.mark.slow
 def test_a_training_without_a_number_of_epochs(schedule: str, command: Command) -> None:
     done = command(
         "train", *QUIET, f"schedule={schedule}", "trainer.max_epochs=-1", "+trainer.max_steps=3", "test=false"
@@ -149,6 +151,7 @@ def test_a_training_without_a_number_of_epochs(schedule: str, command: Command) 
     assert "schedule: the length of the training is not set. Pass trainer.max_epochs" in last_line(done.err)
 
 
+@pytest.mark.slow
 def test_a_schedule_is_not_stretched_when_a_run_goes_on(command: Command, tmp_path: Path) -> None:
     done = command("train", *QUIET, "schedule=warmup_cosine", "+trainer.max_steps=4", "test=false")
     assert done.code == 0, done.err
@@ -162,6 +165,7 @@ def test_a_schedule_is_not_stretched_when_a_run_goes_on(command: Command, tmp_pa
     )
 
 
+@pytest.mark.slow
 def test_early_stopping_waits_for_the_full_size(command: Command, tmp_path: Path) -> None:
     options = ("data.progressive=[{size:[16,32],until:0.8}]", "callbacks=early_stopping", "optim.lr=1e-30")
     patience = ("callbacks.early_stopping.patience=1", "trainer.max_epochs=10")
@@ -180,6 +184,7 @@ def test_recomputed_activations_cannot_be_compiled(command: Command) -> None:
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
+@pytest.mark.slow
 def test_a_compiled_network_trains_to_the_same_and_its_checkpoint_is_like_any_other(
     tmp_path: Path, cache: Path
 ) -> None:
@@ -211,6 +216,7 @@ def test_training_can_start_from_another_run(command: Command, tmp_path: Path) -
     assert "in shares of" not in done.err
 
 
+@pytest.mark.slow
 def test_a_start_with_another_largest_depth_is_named(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=first", "test=false").code == 0
     done = command(
@@ -221,6 +227,7 @@ def test_a_start_with_another_largest_depth_is_named(command: Command, tmp_path:
     assert "Pass data.max_depth_m=10.0 to keep them." in done.err
 
 
+@pytest.mark.slow
 def test_a_start_that_has_seen_what_is_to_judge_it_is_refused(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=first", "data.split=random", "test=false").code == 0
     first = only_run(tmp_path, "first")
@@ -235,6 +242,7 @@ def test_a_start_that_has_seen_what_is_to_judge_it_is_refused(command: Command, 
     assert "pairs were trained on, under data.split=random. Pass the same data.split, or init=null." in done.err
 
 
+@pytest.mark.slow
 def test_a_start_of_other_files_of_the_same_set_is_named(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=first", "test=false", "paths.runs=elsewhere").code == 0
     done = command(
@@ -245,6 +253,7 @@ def test_a_start_of_other_files_of_the_same_set_is_named(command: Command, tmp_p
 
 
 @pytest.mark.parametrize("damage", [{"before": "rooms"}, {"before": [1]}, {"split": {"kind": "random"}}])
+@pytest.mark.slow
 def test_a_start_that_does_not_say_what_it_was_trained_on(
     damage: dict[str, Any], command: Command, tmp_path: Path
 ) -> None:
@@ -259,6 +268,7 @@ def test_a_start_that_does_not_say_what_it_was_trained_on(
     assert re.search(r"does not say what it was trained on|named without its split", last_line(done.err))
 
 
+@pytest.mark.slow
 def test_a_start_of_another_network_is_refused(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=first", "test=false").code == 0
     done = command("train", *QUIET, f"init={only_run(tmp_path, 'first')}", "model=hybrid_unet", "name=second")
@@ -266,6 +276,7 @@ def test_a_start_of_another_network_is_refused(command: Command, tmp_path: Path)
     assert "is from another model" in last_line(done.err)
 
 
+@pytest.mark.slow
 def test_each_look_at_the_test_images_is_kept(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=looked", "protocol=paper", "baselines=false").code == 0
     run = only_run(tmp_path, "looked")
@@ -283,6 +294,7 @@ def test_each_look_at_the_test_images_is_kept(command: Command, tmp_path: Path) 
     assert len(json.loads((run / "scored.json").read_text())) == 3
 
 
+@pytest.mark.slow
 def test_a_test_is_not_lost_because_it_cannot_be_noted(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "test=false").code == 0
     run = only_run(tmp_path, "default")
