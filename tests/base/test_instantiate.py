@@ -62,7 +62,7 @@ def test_outside_the_trusted_modules(target: str) -> None:
     ],
 )  # fmt: skip
 def test_no_such_module(target: str, why: str) -> None:
-    assert refused({"_target_": target}) == f"_target_: '{target}' cannot be imported ({why})."
+    assert f"'{target}' cannot be imported ({why}" in refused({"_target_": target})
 
 
 @pytest.mark.parametrize(
