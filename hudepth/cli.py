@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.base.verbs import COMMANDS, VERBS
+from hudepth.base.verbs import SUBCOMMANDS, commands, module_of
 from hudepth.base.wording import LAUNCHERS, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
@@ -47,8 +47,11 @@ def _main(task: str) -> int:
         return 1
 
 
-train, test, data, report, predict, export, bench, demo = (partial(_main, task) for task in COMMANDS)
-"""The console scripts ``hudepth-train`` and so on; each returns an exit code."""
+def __getattr__(name: str) -> Callable[[], int]:
+    """Return the function of the console script ``hudepth-<name>``; it returns an exit code."""
+    if name in commands():
+        return partial(_main, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def rewrite(task: str, arguments: list[str]) -> list[str]:
@@ -65,12 +68,12 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
         ConfigError: if ``hudepth-data`` or ``hudepth-report`` is given no verb.
     """
     result = [f"+{a}" if a.startswith(tuple(f"{g}=" for g in ADDED_GROUPS)) else a for a in arguments]
-    if task in VERBS and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
-        verbs = [a for a in result if a in VERBS[task]]
+    if task in SUBCOMMANDS and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
+        verbs = [a for a in result if a in SUBCOMMANDS[task]]
         words = [a for a in result if "=" not in a and not a.startswith("-")]
         if not verbs:
-            got = f"no verb '{words[0]}'.{did_you_mean(words[0], VERBS[task])}" if words else "a verb is missing."
-            raise ConfigError(f"{got} Type hudepth-{task} followed by {' or '.join(VERBS[task])}.")
+            got = f"no verb '{words[0]}'.{did_you_mean(words[0], SUBCOMMANDS[task])}" if words else "a verb is missing."
+            raise ConfigError(f"{got} Type hudepth-{task} followed by {' or '.join(SUBCOMMANDS[task])}.")
         result = [f"verb={a}" if a == verbs[0] else a for a in result]
     flags = [a for a in result if a in ("-m", "--multirun")]
     result = [*flags, *(a for a in result if a not in flags)]  # between overrides argparse would stumble over them
@@ -117,7 +120,7 @@ def _run_hydra(task: str) -> int:
 
         setup_logging()
         try:
-            run: Callable[[Any], Any] = getattr(importlib.import_module(f"hudepth.{COMMANDS[task]}.command"), task)
+            run: Callable[[Any], Any] = getattr(importlib.import_module(module_of(task)), task)
             return run(cfg)
         except Exception as error:  # kept from Hydra, which would print it in its own way
             errors.append(error)

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-COMMANDS = {
-    "train": "training", "test": "evaluation", "data": "data", "report": "report", "predict": "inference",
-    "export": "export", "bench": "bench", "demo": "demo",
-}  # fmt: skip
-"""The package behind each console script; its ``command.py`` holds a function of the script's name."""
-
-
-VERBS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "sweep", "figures")}
+SUBCOMMANDS = {"data": ("prepare", "info", "audit"), "report": ("compare", "table", "sweep", "figures")}
 """The first word after the console scripts that can do several things."""
 
 
@@ -25,3 +18,18 @@ def conf_folder() -> Path:
 def options_of(group: str) -> list[str]:
     """Return the choices of a group of the configuration, for example ``data``."""
     return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml") if path.stem != "base")
+
+
+def commands() -> list[str]:
+    """Return the commands: each has a configuration at the top of the tree."""
+    return sorted(path.stem for path in conf_folder().glob("*.yaml"))
+
+
+def module_of(command: str) -> str:
+    """Return the module behind ``hudepth-<command>``: the ``command.py`` with a function of that name.
+
+    Its text is searched, since importing it takes seconds.
+    """
+    paths = sorted(Path(__file__).parents[1].glob("*/command.py"))
+    found = next(path for path in paths if f"\ndef {command}(" in path.read_text(encoding="utf-8"))
+    return f"hudepth.{found.parent.name}.command"
