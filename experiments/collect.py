@@ -1,6 +1,6 @@
-"""Bring a finished run into a study's folder: what it says, not its weights.
+"""Bring a finished run into a study's folder: its results, not its weights.
 
-    python experiments/collect.py <run> <study> [--pages README.md ...] [--hide <text> ...]
+    python -m experiments.collect <run> <study> [--pages README.md ...] [--hide <text> ...]
 
 Copies configuration, environment, split, history, times and test results, draws the curves (figure 5 of the paper) from
 the history, and writes the table of results between the markers of the study's README.md and of --pages.
@@ -13,8 +13,7 @@ import json
 import shutil
 from pathlib import Path
 
-from publish import copy_run, hide
-
+from experiments.studies import copy_run, hide, shrink
 from hudepth.base.files import write_between
 from hudepth.report.curves import draw_curves
 from hudepth.runs.history import read_history
@@ -39,12 +38,13 @@ def main() -> None:
     parser.add_argument("--hide", action="append", default=[], help="text to cut from the files")
     options = parser.parse_args()
     run, study = options.run, options.study
-    copy_run(run, study)
+    copy_run(run, study, tables=["eigen"])
     hide(study, options.hide)
     shutil.copy(run / "test" / "eigen" / "panels.png", study / "panels.png")
     history = read_history(run / "metrics.csv")
     title = f"{run.parent.name}: total loss and raw terms, unit depth"
     save_figure(study / "curves.png", draw_curves(history, title=title))
+    shrink(study)
     metrics = json.loads((study / "test" / "eigen" / "metrics.json").read_text())["metrics"]
     for page in (study / "README.md", *options.pages):
         write_between(page, "results", table(metrics))

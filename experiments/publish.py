@@ -1,9 +1,9 @@
-"""Turn a sweep into what a study's page shows: reports, configuration, and the tables of its README.md.
+"""Bring a sweep into a study's folder: reports, configuration, and the tables of its README.md.
 
-    python experiments/publish.py <sweep_dir> <study> [--reports a,b] [--runs c,d] [--hide <text>]
+    python -m experiments.publish <sweep_dir> <study> [--reports a,b] [--runs c,d] [--hide <text>]
 
-Each report becomes a folder of the study and the table between its markers in the page. Of each variant among --runs
-one run is kept. What --hide names, paths for example, is cut from all files.
+Each report becomes a folder of the study, and the table between its markers in the page. One run is kept of each
+variant among --runs. Texts named by --hide, paths for example, are cut from all files.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hudepth.base.files import write_between, write_text
+from experiments.studies import copy_run, hide, shrink
+from hudepth.base.files import write_between
 
 SHOWN = ("abs_rel", "rmse", "ssim", "delta1", "edge_f1_0.25")
 PLACES = {"abs_rel": 4, "rmse": 3, "ssim": 4, "delta1": 3, "edge_f1_0.25": 3}
 MARKS = {"better": " ▲", "worse": " ▼"}
 REPORT = "document.json"
-TEXTS = (".json", ".yaml", ".html", ".csv", ".md", ".tex", ".txt")
 
 
 def table(document: dict[str, Any]) -> str:
@@ -45,25 +45,6 @@ def cell(row: dict[str, Any], name: str) -> str:
     return f"**{text}**" if metric["best"] else text
 
 
-def copy_run(run: Path, target: Path) -> None:
-    """Copy what a run says, not its weights and pictures: whole, for the ledger of the paper's claims."""
-    for pattern in ("*.yaml", "*.json", "*.csv", "*.txt", "test/*/metrics.json", "test/*/per_image.csv"):
-        for file in run.glob(pattern):
-            (target / file.relative_to(run)).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(file, target / file.relative_to(run))
-
-
-def hide(study: Path, texts: list[str]) -> None:
-    """Cut texts from all files of a study."""
-    for file in study.rglob("*"):
-        if file.suffix in TEXTS:
-            content = before = file.read_text(encoding="utf-8")
-            for text in texts:
-                content = content.replace(text, "")
-            if content != before:
-                write_text(file, content)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sweep", type=Path, help="folder of the sweep")
@@ -82,6 +63,7 @@ def main() -> None:
     for name in options.runs.split(",") if options.runs else []:
         run = next(run for run in sorted(sweep.glob(f"{name}_s*1*")) if (run / "test").is_dir())
         copy_run(run, options.study / f"{name}_seed_1")
+    shrink(options.study)
     hide(options.study, [f"{sweep}/", str(sweep), *options.hide])
     for name in reports:
         document = json.loads((options.study / name / REPORT).read_text(encoding="utf-8"))

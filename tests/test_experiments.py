@@ -11,10 +11,19 @@ from types import ModuleType
 
 import pytest
 
+from experiments.studies import TEXTS
 from hudepth.runs.history import read_history
-from hudepth.runs.results import find_result
+from hudepth.runs.results import MODEL, find_result
 
 STUDIES = Path(__file__).parents[1] / "experiments"
+LIMIT_BYTES = 16_000_000
+"""What the studies may take on disk, the bundled model included."""
+
+
+def read_metrics(study: Path, protocol: str, predictor: str = MODEL) -> dict[str, float]:
+    """Read the test metrics of a predictor."""
+    document = json.loads((study / "test" / protocol / "metrics.json").read_text())
+    return dict(document["metrics"][predictor])
 
 
 @pytest.mark.parametrize(
@@ -50,26 +59,38 @@ def test_split_leakage() -> None:
     assert f"and {same['disjoint'][0]:.3f} for the one that never saw the rooms" in text
     assert f"better than the honest network's {every['disjoint'][0]:.3f}" in text
     assert f"finds a gap of {nyu[1]['abs_rel']['gap'][0]:.3f} on the same images" in text
-    random = find_result(STUDIES / "split_leakage" / "rooms_video_random", "eigen")
-    nearest = random.document["metrics"]["nearest_frame"]["abs_rel"]
+    nearest = read_metrics(STUDIES / "split_leakage" / "rooms_video_random", "eigen", "nearest_frame")["abs_rel"]
     assert f"comes to {nearest:.3f} under the random split" in text
 
 
 def test_units() -> None:
     text = " ".join((STUDIES / "units" / "README.md").read_text().split())
-    right, literal = (find_result(STUDIES / "units" / f"units_{name}", "paper") for name in ("right", "paper_literal"))
+    right, literal = (read_metrics(STUDIES / "units" / f"units_{name}", "paper") for name in ("right", "paper_literal"))
+    mean = read_metrics(STUDIES / "units" / "units_paper_literal", "paper", "mean_depth")
     last = read_history(STUDIES / "units" / "units_paper_literal" / "metrics.csv")[-1]
-    assert f"has SSIM {literal.metrics['ssim']:.3f} and a validation loss of {last['val/loss/total']:.4f}" in text
-    assert f"has SSIM {literal.document['metrics']['mean_depth']['ssim']:.3f}. Read rightly" in text
-    assert f"abs_rel {literal.metrics['abs_rel']:.3f} against {right.metrics['abs_rel']:.3f}" in text
-    assert f"rmse came to {literal.metrics['rmse']:.3f}" in text
+    assert f"has SSIM {literal['ssim']:.3f} and a validation loss of {last['val/loss/total']:.4f}" in text
+    assert f"has SSIM {mean['ssim']:.3f}. Read rightly" in text
+    assert f"abs_rel {literal['abs_rel']:.3f} against {right['abs_rel']:.3f}" in text
+    assert f"rmse came to {literal['rmse']:.3f}" in text
 
 
 def test_every_result_of_a_study_can_be_read() -> None:
     files = sorted(STUDIES.glob("**/test/*/metrics.json"))
     assert len(files) > 15
     for file in files:
-        assert find_result(file.parent, file.parent.name).metrics["abs_rel"] > 0
+        assert read_metrics(file.parents[2], file.parent.name)["abs_rel"] > 0
+        if (file.parent / "per_image.csv").exists():  # then it belongs to the metrics
+            find_result(file.parent, file.parent.name)
+
+
+def test_the_studies_stay_small() -> None:
+    assert sum(file.stat().st_size for file in STUDIES.rglob("*") if file.is_file()) < LIMIT_BYTES
+
+
+def test_links_of_the_studies_lead_somewhere() -> None:
+    for page in STUDIES.rglob("*.md"):
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
+            assert target.startswith("https://") or (page.parent / target).exists(), f"{page}: {target}"
 
 
 def load(script: Path) -> ModuleType:
@@ -91,7 +112,7 @@ def test_tables_of_sweeps() -> None:
 
 
 def test_no_study_names_folders_of_the_machine_it_ran_on() -> None:
-    suffixes = load(STUDIES / "publish.py").TEXTS
+    suffixes = TEXTS
     for file in STUDIES.rglob("*"):
         if file.suffix in suffixes:
             assert not re.search(r"/(root|work|home)/", file.read_text()), file
@@ -126,7 +147,7 @@ def test_what_the_readme_says_of_the_recipes() -> None:
     row = document["metrics"]["abs_rel"]
     assert f"test abs_rel is {-100 * row['difference'] / row['a']:.1f} % lower" in readme
     assert document["metrics"]["edge_f1_0.25"]["verdict"] == "b better"
-    paper = find_result(STUDIES / "badcl_official", "eigen").metrics
+    paper = read_metrics(STUDIES / "badcl_official", "eigen")
     assert f"reaches abs_rel {paper['abs_rel']:.3f} and delta1 {paper['delta1']:.3f}" in " ".join(readme.split())
 
 
@@ -156,12 +177,12 @@ def test_what_the_study_of_the_model_that_comes_along_says_of_its_trainings() ->
     fifth, last = second[4], second[-1]
     assert f"falls from {fifth['val/abs_rel']:.3f} to {last['val/abs_rel']:.3f}" in text
     assert f"training loss by {100 * (1 - last['train/loss/total'] / fifth['train/loss/total']):.0f} %" in text
-    before, now = (find_result(study / name, "eigen").metrics for name in ("first", "."))
+    before, now = (read_metrics(study / name, "eigen") for name in ("first", "."))
     assert f"abs_rel {before['abs_rel']:.3f}, delta1 {before['delta1']:.3f})" in text
     assert (
         f"F1 at 0.25 was {before['edge_f1_0.25']:.3f} after the first training and is {now['edge_f1_0.25']:.3f}" in text
     )
-    paper = find_result(STUDIES / "badcl_official", "eigen").metrics
+    paper = read_metrics(STUDIES / "badcl_official", "eigen")
     assert f"Abs_rel is {100 * (1 - now['abs_rel'] / paper['abs_rel']):.0f} % lower" in text
     chosen = json.loads((study / "nyu" / "config.json").read_text())["epoch"]
     losses = [row["train/loss/total"] for row in read_history(study / "metrics.csv")]

@@ -1,8 +1,8 @@
 """Compare the two runs of this folder image by image, and write the table of README.md.
 
-    python experiments/equal_budget/table.py [<run of the paper's recipe> <run of experiment/strong> [<text to cut>]]
+    python -m experiments.equal_budget.table [<run of the paper's recipe> <run of experiment/strong> [<text to cut>]]
 
-With two runs, what they say is copied here first.
+Given two runs, it copies their results here first.
 """
 
 from __future__ import annotations
@@ -13,10 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from publish import copy_run, hide
-
+from experiments.studies import copy_run, hide, shrink
 from hudepth.base.files import write_between
 
 HERE = Path(__file__).parent
@@ -37,11 +34,12 @@ def table(document: dict[str, Any]) -> str:
 
 def main(*words: str) -> None:
     for name, run in zip(RUNS, words[:2], strict=False):
-        copy_run(Path(run), HERE / name)
+        copy_run(Path(run), HERE / name, tables=["eigen"])
     command = ["hudepth-report", "compare", *(f"{key}={HERE / run}" for key, run in zip("ab", RUNS, strict=True))]
     subprocess.run(
         [str(Path(sys.executable).parent / command[0]), *command[1:], f"output={HERE / 'compare'}"], check=True
     )
+    shrink(HERE)
     hide(HERE, [f"{HERE}/", *words[2:]])
     document = json.loads((HERE / "compare" / "compare.json").read_text(encoding="utf-8"))
     write_between(HERE / "README.md", "table", table(document))

@@ -1,7 +1,7 @@
-"""Bring a benchmark's tables here, and its figures at batch 1 and 8 into the README, between its markers.
+"""Copy a benchmark's tables here, and write its figures at batch 1 and 8 between the markers of docs/deployment.md.
 
 hudepth-bench checkpoint=<run> repeats=3 seconds=0.7 output=inference
-python experiments/speed/inference_table.py inference
+python -m experiments.speed.inference_table inference
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import shutil
 import sys
 from pathlib import Path
 
+from experiments.studies import to_webp
 from hudepth.base.files import write_between
 
 ROOT = Path(__file__).parents[2]
-KEPT = ("bench.md", "bench.csv", "bench.png", "bench.json")
+
+KEPT = ("bench.md", "bench.csv", "bench.json")
 SHOWN = {
     "eager": "plain PyTorch", "channels_last": "channels-last", "default": "what `predict` and `test` use",
     "compile": "the same, `torch.compile`", "onnxruntime": "ONNX Runtime", "openvino": "OpenVINO",
@@ -43,5 +45,6 @@ if __name__ == "__main__":
     target.mkdir(exist_ok=True)
     for name in KEPT:
         shutil.copyfile(Path(sys.argv[1]) / name, target / name)
+    (target / "bench.webp").write_bytes(to_webp((Path(sys.argv[1]) / "bench.png").read_bytes()))
     with (target / "bench.csv").open(encoding="utf-8") as file:
-        write_between(ROOT / "README.md", "speed", table(list(csv.DictReader(file))))
+        write_between(ROOT / "docs" / "deployment.md", "speed", table(list(csv.DictReader(file))))

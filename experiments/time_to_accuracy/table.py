@@ -1,6 +1,6 @@
 """When does each run first reach the best validation abs_rel of the paper's recipe? From the runs' own histories.
 
-python experiments/time_to_accuracy/table.py [<run of the paper's recipe> <run of experiment/strong> [<text to cut>]]
+python -m experiments.time_to_accuracy.table [<run of the paper's recipe> <run of experiment/strong> [<text to cut>]]
 
 With two runs, their histories are copied here first.
 """
@@ -10,10 +10,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from publish import copy_run, hide
-
+from experiments.studies import copy_run, hide
 from hudepth.base.files import write_between
 from hudepth.runs.history import read_history
 from hudepth.training.times import read_times

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError
@@ -21,7 +20,7 @@ from hudepth.bench.subject import make_subject
 from hudepth.bench.worker import ContenderError
 
 
-def bench(cfg: DictConfig) -> None:
+def bench(cfg: Any) -> None:
     """Measure, print the table, write bench.json, bench.csv, bench.md and bench.png.
 
     Args:
