@@ -25,8 +25,9 @@ import yaml
 from lightning.pytorch import Trainer
 from torch import nn
 
-from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.dataset import StoreDataset
+from hudepth.data.preprocess import preprocess
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.evaluation.baselines import trivial_baselines
 from hudepth.evaluation.routine import Evaluation

@@ -30,7 +30,8 @@ from hudepth.base.instantiate import instantiate
 from hudepth.base.machine import keep_freed_memory
 from hudepth.base.types import Batch
 from hudepth.data.build import build_data
-from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.preprocess import preprocess
 from hudepth.training.fit import build_module
 from hudepth.training.module import DepthModule
 from hudepth.training.options import MEMORY_FORMATS

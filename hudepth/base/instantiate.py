@@ -36,6 +36,11 @@ def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type =
     return _build(config, prefixes, only, args, extra)
 
 
+def has_target(config: Mapping[str, Any] | None) -> bool:
+    """Return whether an optional part of a configuration describes something to build."""
+    return bool(config and config.get("_target_"))
+
+
 def _build(
     config: Any, prefixes: tuple[str, ...], only: type, args: tuple[Any, ...] = (), extra: Mapping[str, Any] = {}
 ) -> Any:

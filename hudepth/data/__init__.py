@@ -1,1 +1,15 @@
 """Sources, the depth store, splits and batches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["NYUDepth"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "NYUDepth":  # on first use: processes that prepare data import this package and need no torch
+        from hudepth.data.nyu_depth import NYUDepth
+
+        return NYUDepth
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Turn a source into a depth store: decode each pair once, check its units, resize, write."""
+"""Turn a source into a depth store: decode each pair once, check its unit, resize, write."""
 
 from __future__ import annotations
 
@@ -7,28 +7,32 @@ import hashlib
 import shutil
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from filelock import FileLock
 
 from hudepth.base.console import log, track
-from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
+from hudepth.base.options import convert
 from hudepth.data.encoding import check_range
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.store import VERSION, DepthStore, StoreWriter
 
 MAX_SIZES = 16
-"""Sizes of images that a store names, of a set that has many."""
+"""Largest number of image sizes that a store lists."""
 UNIT_SAMPLES = 16
-"""Pairs whose depth is checked for plausible units before the others are read."""
+"""Number of pairs whose depth is checked for a plausible unit beforehand."""
+
+OnError = Literal["raise", "skip"]
 
 
 def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Path) -> Path:
-    """Where the store of this source, size and encoding lies: equal inputs give equal names, changed files new ones.
+    """Return the path of the store of this source and size: equal inputs give equal names, changed files new ones.
 
     Raises:
         DataError: if the source's root or index cannot be read.
@@ -47,29 +51,27 @@ def prepare(
     on_error: str = "raise",
     workers: int | None = None,
 ) -> DepthStore:
-    """Return the depth store of ``source``, preparing it unless that has been done.
+    """Return the depth store of ``source``, and prepare it first if it does not exist.
 
-    Safe to call from several jobs at once: one prepares, the others wait. Killed half-way, it leaves nothing that a
-    later call would take for a store.
+    Safe to call from several jobs at once: one prepares, the others wait. A call that is killed leaves no store.
 
     Args:
-        source: where the pairs come from.
+        source: the data set.
         size: (height, width) of images and depths in the store; images are averaged over areas, depths take the
             nearest pixel, since a mean of two surfaces is the depth of neither.
         cache: folder of all stores.
-        native: also keep the truth at its native resolution, which protocols like ``eigen`` score against.
+        native: also keep the ground truth at its native resolution, for protocols like ``eigen``.
         on_error: ``raise`` at the first bad pair, or ``skip`` bad pairs and list them.
-        workers: processes; default one per core.
+        workers: processes; one per core by default.
 
     Raises:
         ConfigError: for an unknown ``on_error``.
         DataError: for bad pairs, implausible units, or a folder that cannot be written.
     """
-    if on_error not in ("raise", "skip"):
-        raise ConfigError(f"data.on_error: no '{on_error}'. Pass raise or skip.")
+    convert("data.on_error", on_error, OnError)
     path = store_path(source, size=size, native=native, cache=Path(cache).expanduser())
     try:
-        if not path.exists():  # first without the lock, which a cache that can only be read has no place for
+        if not path.exists():  # try without the lock first, for caches that are read-only
             path.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(path.with_suffix(".lock")):
                 if not path.exists():
@@ -84,13 +86,13 @@ def prepare(
     if store.info["skipped"] and on_error == "raise":
         raise DataError(
             f"{source.name}: {len(store.info['skipped'])} pairs could not be read, the first: "
-            f"{store.info['skipped'][0]} Mend them, or pass data.on_error=skip to go on without them."
+            f"{store.info['skipped'][0]} Fix them, or pass data.on_error=skip to leave them out."
         )
     return store
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Remove what a killed run left; the lock is held, so nobody writes to it."""
+    """Remove what a killed run left; only called while holding the lock."""
     for leftover in path.parent.glob(f".{path.name}.*.part"):
         leftover.unlink(missing_ok=True)
 
@@ -102,7 +104,7 @@ def _build(
     _check_units(source, records)
     _check_space(path.parent, len(records), size)
     skipped: list[str] = []
-    pairs: list[PreparedPair] = []  # the small figures only: pixels are dropped once written
+    pairs: list[PreparedPair] = []  # without their pixels
     with written_whole(path) as part:
         writer = StoreWriter(part, size=size, native=native)
         try:
@@ -111,9 +113,7 @@ def _build(
                 for record, outcome in track(outcomes, total=len(records), what=f"preparing {source.name}"):
                     if isinstance(outcome, str):
                         if on_error == "raise":
-                            raise DataError(
-                                f"{outcome} Mend it, or pass data.on_error=skip to go on without such pairs."
-                            )
+                            raise DataError(f"{outcome} Fix it, or pass data.on_error=skip to leave out such pairs.")
                         skipped.append(outcome)
                         continue
                     writer.append(record, outcome.image, outcome.depth_mm, outcome.native_png)
@@ -129,7 +129,7 @@ def _build(
 
 
 def _check_units(source: Source, records: Sequence[Record]) -> None:
-    """Refuse implausible units before hours are spent on them."""
+    """Refuse implausible units before spending hours on them."""
     if not records:
         raise DataError(f"{source.name}: the set is empty. Check data.root.")
     step = max(1, len(records) // UNIT_SAMPLES)
@@ -138,27 +138,26 @@ def _check_units(source: Source, records: Sequence[Record]) -> None:
         try:
             raw = source.read(record).depth
         except DataError:
-            continue  # a bad file is dealt with in its turn
+            continue  # reported later, in its turn
         try:
             depths.append(read_metres(source, record, raw))
         except DataError as error:
             refused.append(error)
-    if refused and not depths:  # not one bad file but the wrong encoding for all
+    if refused and not depths:  # the wrong encoding, not one bad file
         raise refused[0]
     if any((depth > 0).any() for depth in depths):
         check_range(depths, indoor=source.indoor, encoding=source.encoding, name=source.name)
 
 
 def _check_space(folder: Path, pairs: int, size: tuple[int, int]) -> None:
-    """Refuse a disk that has no room for the images and depths, before it is full."""
+    """Refuse a disk without room for the images and depths before filling it."""
     needed, free = 5 * pairs * size[0] * size[1], shutil.disk_usage(folder).free
     if needed > free:
         raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
 
 
 def _figures(pair: PreparedPair) -> PreparedPair:
-    empty = np.empty(0, np.uint8)
-    return PreparedPair(empty, empty.astype(np.uint16), None, pair.native_size, pair.range_m, pair.valid_fraction)
+    return replace(pair, image=np.empty(0, np.uint8), depth_mm=np.empty(0, np.uint16), native_png=None)
 
 
 def _info(source: Source, pairs: Sequence[PreparedPair], skipped: list[str]) -> dict[str, Any]:

@@ -12,8 +12,9 @@ import torch
 from torch import nn
 
 from hudepth.base.errors import DataError
-from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.dataset import StoreDataset
+from hudepth.data.preprocess import preprocess
 from hudepth.data.store import DepthStore
 from hudepth.evaluation.test_data import open_data
 from hudepth.runs.checkpoint import load_checkpoint

@@ -14,9 +14,9 @@ from torch.optim.lr_scheduler import LRScheduler
 from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.base.instantiate import instantiate
+from hudepth.base.instantiate import has_target, instantiate
 from hudepth.base.machine import keep_freed_memory
-from hudepth.data.build import build_data, is_given
+from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE
@@ -63,7 +63,7 @@ def build_datamodule(training: Training) -> DepthDataModule:
     """Prepare the data, and check the protocols of the final test while nothing is lost yet."""
     config, trust = training.config, training.options.trust
     distill = config.get("distill") or {}
-    teacher = {"teacher": distill["teacher"]} if is_given(distill) else {}
+    teacher = {"teacher": distill["teacher"]} if has_target(distill) else {}
     data = build_data({**config["data"], **teacher}, trust=trust, augment=config.get("augment"))
     if data.source.name == "rooms":
         log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
@@ -153,8 +153,8 @@ def build_module(
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
         optimizer=optimizer,
-        distill=instantiate(distill, trust=trust, only=nn.Module) if is_given(distill) else None,
-        scheduler=schedule if is_given(config["schedule"]) else None,
+        distill=instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None,
+        scheduler=schedule if has_target(config["schedule"]) else None,
         record={"config": dict(config), "split": datamodule.split.summary(), "data": data},
     )
 

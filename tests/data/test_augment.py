@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -17,18 +16,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from hudepth.base.errors import ConfigError
-from hudepth.data.augment import (
-    MAX_BLUR,
-    Augmentation,
-    Geometry,
-    _at_most_twice,
-    _range,
-    blur,
-    change_colours,
-    cut_depth,
-    resize,
-    warp,
-)
+from hudepth.data.augment import Augmentation
+from hudepth.data.colours import MAX_BLUR, blur, change_colours, cut_depth
+from hudepth.data.warp import Geometry, _at_most_twice, resize, warp
 
 EVERYTHING: dict[str, Any] = {
     "flip": 0.5, "zoom": (1.0, 2.0), "rotate_deg": 20.0, "border": 0.05, "gamma": (0.5, 2.0), "brightness": (0.5, 1.5),
@@ -610,72 +600,18 @@ def test_what_is_within_the_border_is_all_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options",
     [
-        ({"flip": 1.5}, "augment.flip: 1.5 is not in [0, 1]."),
-        ({"flip": -0.1}, "augment.flip: -0.1 is not in [0, 1]."),
-        ({"grey": math.nan}, "augment.grey: nan is not in [0, 1]."),
-        ({"cut_depth": 2}, "augment.cut_depth: 2 is not in [0, 1]."),
-        ({"cut_depth_size": 1.01}, "augment.cut_depth_size: 1.01 is not in [0, 1]."),
-        ({"tint": 0.6}, "augment.tint: 0.6 is not in [0, 0.5]."),
-        ({"noise": math.inf}, "augment.noise: inf is not in [0, 1]."),
-        ({"blur": 3.5}, "augment.blur: 3.5 is not in [0, 3]."),
-        ({"rotate_deg": 90}, "augment.rotate_deg: 90 is not in [0, 45]."),
-        (
-            {"border": 0.45},
-            "augment.border: 0.45 of each side would leave 10% of an image. Pass at most 0.4; of NYU's labelled set "
-            "0.02 covers the white frame.",
-        ),
-        (
-            {"border": 0.7},
-            "augment.border: 0.7 of each side would leave 0% of an image. Pass at most 0.4; of NYU's labelled set "
-            "0.02 covers the white frame.",
-        ),
-        (
-            {"zoom": [0.5, 2.0]},
-            "augment.zoom: [0.5, 2.0] is not [lowest,highest] within [1, 8]. Pass augment.zoom=[1,1] to leave it out.",
-        ),
-        (
-            {"zoom": [1.0, 9.0]},
-            "augment.zoom: [1.0, 9.0] is not [lowest,highest] within [1, 8]. Pass augment.zoom=[1,1] to leave it out.",
-        ),
-        (
-            {"gamma": (2.0, 1.0)},
-            "augment.gamma: [2.0, 1.0] is not [lowest,highest] within [0.1, 10]. "
-            "Pass augment.gamma=[1,1] to leave it out.",
-        ),
-        (
-            {"brightness": [-1.0, 1.0]},
-            "augment.brightness: [-1.0, 1.0] is not [lowest,highest] within [0, 10]. "
-            "Pass augment.brightness=[1,1] to leave it out.",
-        ),
-        (
-            {"contrast": [1.0]},
-            "augment.contrast: [1.0] is not [lowest,highest] within [0, 10]. "
-            "Pass augment.contrast=[1,1] to leave it out.",
-        ),
-        (
-            {"saturation": [math.nan, 1.0]},
-            "augment.saturation: [nan, 1.0] is not [lowest,highest] within [0, 10]. "
-            "Pass augment.saturation=[1,1] to leave it out.",
-        ),
+        {"flip": 1.5}, {"flip": -0.1}, {"grey": math.nan}, {"cut_depth": 2}, {"cut_depth_size": 1.01}, {"tint": 0.6},
+        {"noise": math.inf}, {"blur": 3.5}, {"rotate_deg": 90}, {"border": 0.45}, {"zoom": [0.5, 2.0]},
+        {"zoom": [1.0, 9.0]}, {"gamma": (2.0, 1.0)}, {"brightness": [-1.0, 1.0]}, {"contrast": [1.0]},
+        {"saturation": [math.nan, 1.0]},
     ],
-)
-def test_bad_options_say_what_to_do(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+)  # fmt: skip
+def test_bad_options_are_refused(options: dict[str, Any]) -> None:
+    (key,) = options
+    with pytest.raises(ConfigError, match=rf"^augment\.{key}: .* is not "):
         Augmentation(**options)
-    assert str(caught.value) == message
-
-
-def test_a_number_in_the_place_of_a_range() -> None:
-    bare: Callable[..., Any] = _range
-    while hasattr(bare, "__wrapped__"):  # the checker of the tests would refuse the type before the function does
-        bare = bare.__wrapped__
-    with pytest.raises(ConfigError) as caught:
-        bare("zoom", 1.5, least=1.0, most=8.0)
-    assert str(caught.value) == (
-        "augment.zoom: 1.5 is not [lowest,highest] within [1, 8]. Pass augment.zoom=[1,1] to leave it out."
-    )
 
 
 def test_some_images_are_not_zoomed_at_all() -> None:

@@ -16,7 +16,8 @@ from hypothesis.extra.numpy import arrays
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.types import Batch, RawBatch
-from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.preprocess import preprocess
 from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.data.splits import make_split
@@ -145,12 +146,13 @@ def test_a_store_without_native_truth_gives_none(make: Make) -> None:
     assert "native_depth" not in data.on_after_batch_transfer(raw, 0)
 
 
+@pytest.mark.slow
 def test_rooms_with_holes(tmp_path: Path) -> None:
-    source = RoomsSource(scenes=5, frames_per_scene=2, size=(48, 64), holes=True)
-    data = DepthDataModule(source, size=(32, 32), split="scene", fractions=(0.6, 0.2, 0.2), cache=tmp_path)
+    source = RoomsSource(scenes=5, frames_per_scene=2, size=(24, 32), holes=True)
+    data = DepthDataModule(source, size=(16, 16), split="scene", fractions=(0.6, 0.2, 0.2), cache=tmp_path)
     raw = next(iter(data.train_dataloader()))
     batch = data.on_after_batch_transfer(raw, 0)
-    assert batch["image"].shape == (6, 3, 32, 32)
+    assert batch["image"].shape == (6, 3, 16, 16)
     assert 0 < batch["valid"].float().mean() < 1
     assert not batch["unit_depth"][~batch["valid"]].any()
     assert 0 < batch["unit_depth"][batch["valid"]].min() < batch["unit_depth"].max() <= 1
@@ -256,34 +258,27 @@ class OneBadSource(NoiseSource):
 
 
 def test_on_error_reaches_the_preparation(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"'03': damaged\. Mend it, or pass data\.on_error=skip"):
+    with pytest.raises(DataError, match=r"'03': damaged\. Fix it, or pass data\.on_error=skip"):
         DepthDataModule(OneBadSource(), size=SIZE, cache=tmp_path).prepare_data()
     assert len(DepthDataModule(OneBadSource(), size=SIZE, cache=tmp_path, on_error="skip").store) == 23
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options",
     [
-        ({"size": [224]}, "data.size: [224] is not [height,width]. Pass data.size=[224,224]."),
-        ({"size": [0, 224]}, "data.size: [0, 224] is not [height,width]. Pass data.size=[224,224]."),
-        ({"size": [1, 2, 3]}, "data.size: [1, 2, 3] is not [height,width]. Pass data.size=[224,224]."),
-        ({"batch_size": 0}, "data.batch_size: 0 is less than 1."),
-        ({"num_workers": -1}, "data.num_workers: -1 is less than 0."),
-        ({"prepare_workers": 0}, "data.prepare_workers: 0 is less than 1."),
-        ({"max_depth_m": 0.0}, "data.max_depth_m: 0.0 is not a positive number of metres."),
-        ({"max_depth_m": math.nan}, "data.max_depth_m: nan is not a positive number of metres."),
-        ({"max_depth_m": math.inf}, "data.max_depth_m: inf is not a positive number of metres."),
-        ({"split": "scenes"}, "data.split: no 'scenes'. Did you mean 'scene'? Pass one of random, scene, official."),
-        (
-            {"fractions": [0.7, 0.3]},
-            "data.fractions: [0.7, 0.3] are not three shares that sum to 1, as [0.7,0.1,0.2] do.",
-        ),
+        {"size": [224]}, {"size": [0, 224]}, {"size": [1, 2, 3]}, {"batch_size": 0}, {"num_workers": -1},
+        {"prepare_workers": 0}, {"shuffle_block": 0}, {"max_depth_m": 0.0}, {"max_depth_m": math.nan},
+        {"max_depth_m": math.inf}, {"split": "scenes"}, {"fractions": [0.7, 0.3]}, {"on_error": "ignore"},
     ],
-)
-def test_options_out_of_range_are_refused_at_once(make: Make, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+)  # fmt: skip
+def test_options_out_of_range_are_refused_at_once(make: Make, options: dict[str, Any]) -> None:
+    (key,) = options
+    with pytest.raises(ConfigError, match=rf"^data\.{key}: "):
         make(**options)
-    assert str(caught.value) == message
+
+
+def test_one_number_makes_a_square(make: Make) -> None:
+    assert make(size=224).size == (224, 224)
 
 
 @pytest.mark.parametrize(("truth", "left", "emptied"), [(900, 0, True), (900, 900, False), (0, 0, False)])

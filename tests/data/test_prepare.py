@@ -213,7 +213,7 @@ def test_size_encoding_and_native_truth_give_another_store(root: Path, cache: Pa
 def test_unknown_on_error(root: Path, cache: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         prepare(write_set(root, 1), size=SIZE, cache=cache, on_error="ignore")
-    assert str(caught.value) == "data.on_error: no 'ignore'. Pass raise or skip."
+    assert str(caught.value).startswith("data.on_error: 'ignore' is not one of raise, skip")
 
 
 def cut(path: Path) -> None:
@@ -227,7 +227,7 @@ def no_depth(root: Path) -> str:
 
 def truncated_png(root: Path) -> str:
     cut(root / "depths/02.png")
-    return f"'{root}/depths/02.png': the PNG is truncated (PNG data without its end). Copy the file again."
+    return f"'{root}/depths/02.png': the PNG is truncated or damaged (no end of the image). Copy the file again."
 
 
 def truncated_jpeg(root: Path) -> str:
@@ -235,7 +235,7 @@ def truncated_jpeg(root: Path) -> str:
     (root / "images/02.png").unlink()
     cv2.imwrite(str(root / "images/02.jpg"), image)
     cut(root / "images/02.jpg")
-    return f"'{root}/images/02.jpg': the JPEG is truncated (JPEG data without its end). Copy the file again."
+    return f"'{root}/images/02.jpg': the JPEG is truncated or damaged (no end of the image). Copy the file again."
 
 
 def unequal(root: Path) -> str:
@@ -258,7 +258,7 @@ SPOILS = [no_depth, truncated_png, truncated_jpeg, unequal, one_of_8_bits]
 def test_a_bad_pair_is_named_and_leaves_no_store(root: Path, cache: Path, spoil: Callable[[Path], str]) -> None:
     source = write_set(root)
     line = spoil(root)
-    advice = "Mend it, or pass data.on_error=skip to go on without such pairs."
+    advice = "Fix it, or pass data.on_error=skip to leave out such pairs."
     assert refusal(source, cache) == f"{line} {advice}"
 
 
@@ -277,8 +277,7 @@ def test_a_bad_pair_is_skipped_and_listed(
     with pytest.raises(DataError) as caught:
         prepare(source, size=SIZE, cache=cache, on_error="raise")
     assert str(caught.value) == (
-        f"folder: 1 pairs could not be read, the first: {line} "
-        "Mend them, or pass data.on_error=skip to go on without them."
+        f"folder: 1 pairs could not be read, the first: {line} Fix them, or pass data.on_error=skip to leave them out."
     )
     write_pair(root, "02", seed=9)
     (root / "images/02.jpg").unlink(missing_ok=True)
@@ -327,8 +326,7 @@ def test_implausible_units_are_refused_before_the_rest_is_read(root: Path, cache
     assert message.startswith("data.encoding=uint16_mm: 'folder' has a median depth of 0.0")
     assert message.endswith(
         " m, indoor sets lie in 0.3 to 20 m. Pass another data.encoding "
-        "(uint8_10m, float_m, linear, paper_literal); "
-        "folders and manifests that are not indoors take data.source.indoor=false."
+        "(uint8_10m, float_m, linear, paper_literal), or data.source.indoor=false for outdoor pairs."
     )
     assert len(source.seen) == UNIT_SAMPLES
     assert int(source.seen[-1]) >= 30  # from all of the set

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.types import Batch
-from hudepth.data.datamodule import DepthDataModule, preprocess
+from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.dataset import StoreDataset
+from hudepth.data.preprocess import preprocess
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.evaluation.baselines import ConstantDepth, trivial_baselines
 from hudepth.evaluation.grids import SUM_COLUMNS

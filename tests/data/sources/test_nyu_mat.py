@@ -23,7 +23,7 @@ RAW_DEPTHS = DEPTHS * (DEPTHS > 3)
 NAME = "nyu_depth_v2_labeled.mat"
 
 
-def write_mat(folder: Path) -> Path:
+def write_mat(folder: Path, scenes: tuple[str, ...] = SCENES) -> Path:
     """Write [N, 3, W, H] and [N, W, H] arrays and references to names, behind MATLAB's 512 bytes."""
     path = folder / NAME
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -31,7 +31,7 @@ def write_mat(folder: Path) -> Path:
         file["depths"] = DEPTHS.transpose(0, 2, 1)
         file["rawDepths"] = RAW_DEPTHS.transpose(0, 2, 1)
         names = []
-        for index, scene in enumerate(SCENES):
+        for index, scene in enumerate(scenes):
             file[f"#refs#/{index}"] = np.array([[ord(letter)] for letter in scene], np.uint16)
             names.append(file[f"#refs#/{index}"].ref)
         table = file.create_dataset("scenes", (1, 3), dtype=h5py.ref_dtype)

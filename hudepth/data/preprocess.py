@@ -1,0 +1,52 @@
+"""From what the loader reads to what a network takes, on whatever device the batch is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from hudepth.base.normalise import normalise_image
+from hudepth.base.types import Batch, RawBatch
+from hudepth.data.warp import resize
+
+
+def preprocess(
+    batch: RawBatch,
+    *,
+    max_depth_m: float,
+    size: tuple[int, int] | None = None,
+    augment: Callable[..., tuple[Tensor, Tensor]] | None = None,
+) -> Batch:
+    """Normalise a batch: ImageNet statistics for the image; depth divided, clipped, masked.
+
+    Args:
+        batch: RGB bytes and millimetres.
+        max_depth_m: maximum depth [m]; depth is clipped to it and divided by it.
+        size: (height, width) of the result; unchanged by default.
+        augment: changes the image in [0, 1] and the unit depth, and resizes them to ``size``.
+    """
+    image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format) / 255
+    unit_depth = batch["depth_mm"].to(torch.float32)[:, None] / (1000 * max_depth_m)
+    had_truth = unit_depth > 0
+    if "teacher_m" in batch:
+        unit_depth = torch.cat(
+            [unit_depth, batch["teacher_m"][:, None] / max_depth_m], dim=1
+        )  # moved like the ground truth
+    size = size or (image.shape[-2], image.shape[-1])
+    image, depths = (augment or resize)(image, unit_depth, size=size)
+    unit_depth = depths[:, :1]
+    result = Batch(
+        image=normalise_image(image),
+        unit_depth=unit_depth.clamp(max=1),
+        valid=unit_depth > 0,
+        index=batch["index"],
+    )
+    if augment is not None:
+        result["emptied"] = had_truth.any() & ~result["valid"].any()
+    if "teacher_m" in batch:
+        result["teacher"] = depths[:, 1:]
+    if "native_depth" in batch:
+        result["native_depth"] = batch["native_depth"]
+    return result
