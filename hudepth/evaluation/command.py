@@ -1,37 +1,54 @@
-"""hudepth-test: score a checkpoint under one or more protocols, beside trivial baselines."""
+"""hudepth-test: score a checkpoint under one or more protocols, alongside trivial baselines."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hudepth.base.console import log
-from hudepth.base.options import plain
-from hudepth.evaluation.score import score_checkpoint
+from hudepth.base.options import parse, plain
+from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.evaluation.test_data import open_data
 from hudepth.runs.checkpoint import load_checkpoint
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandOptions(ScoreOptions):
+    """Options of hudepth-test."""
+
+    checkpoint: str
+    """File, run directory, ``last``, or the name of a bundled pretrained model."""
+    paths: Mapping[str, str]
+    """``runs`` and ``cache``."""
+    data: Mapping[str, Any] | None = None
+    """Overrides of the checkpoint's data, or another data set."""
+    output: Path | None = None
+    """Folder to write to; by default ``test`` in the run directory, else next to the working directory."""
 
 
 def test(cfg: DictConfig) -> None:
     """Score a checkpoint and write ``test/<protocol>/`` of its run directory.
 
     Args:
-        cfg: what conf/test.yaml and the command line compose to.
+        cfg: conf/test.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user.
     """
-    config = plain(cfg)
-    checkpoint = load_checkpoint(str(config["checkpoint"]), runs=config["paths"]["runs"])
-    # The checkpoint may be a stranger's: it says what to read, but not where to write.
-    typed = {"cache": config["paths"]["cache"], **(config.get("data") or {})}
+    options = parse(CommandOptions, plain(cfg))
+    checkpoint = load_checkpoint(options.checkpoint, runs=options.paths["runs"])
     log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data.get("source"))
+    # An untrusted checkpoint may choose what to read, but not where to write.
+    overrides = {"cache": options.paths["cache"], **(options.data or {})}
     datamodule, other_data = open_data(
-        checkpoint, typed, overrides=list(HydraConfig.get().overrides.task), trust=config["trust"]
+        checkpoint, overrides, typed=HydraConfig.get().overrides.task, trust=options.trust
     )
-    output = config["output"] or (checkpoint.run / "test" if checkpoint.run else f"test_{checkpoint.path.stem}")
-    if config["output"] is None and other_data and checkpoint.run:
-        output = checkpoint.run / f"test_{datamodule.source.name}"
-    score_checkpoint(checkpoint, config=config, output=Path(output), datamodule=datamodule)
+    output = options.output or Path(f"test_{checkpoint.path.stem}")
+    if options.output is None and checkpoint.run:
+        output = checkpoint.run / (f"test_{datamodule.source.name}" if other_data else "test")
+    score_checkpoint(checkpoint, options, output=output, datamodule=datamodule)

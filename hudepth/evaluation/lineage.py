@@ -1,4 +1,4 @@
-"""What a network has seen before: no pair that it, or what it started from, learned or was chosen by may score it."""
+"""What a network was trained on: no model is evaluated on data that it, or what it started from, was trained on."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import Checkpoint
 
 BEFORE = "before"
-"""Key of a checkpoint's ``data``: what the network that it started from was trained on, oldest last."""
+"""Key of a checkpoint's ``data``: what the network it started from was trained on, oldest last."""
 
 
 def lineage(checkpoint: Checkpoint) -> list[dict[str, Any]]:
-    """Return what a checkpoint was trained on, then what it had started from: data, split and, if known, split.json.
+    """Return what a checkpoint was trained on (data and split), then what the networks it started from were.
 
     Raises:
-        CheckpointError: if it says so in no form that we know.
+        CheckpointError: if the checkpoint does not state it in a known form.
     """
     own = {key: value for key, value in checkpoint.data.items() if key != BEFORE}
     before = checkpoint.data.get(BEFORE, [])
     if not isinstance(before, list) or not all(isinstance(past, dict) for past in before):
-        raise CheckpointError(f"'{checkpoint.path}' is damaged: it does not say what it was trained on.")
+        raise CheckpointError(f"'{checkpoint.path}' is damaged: it does not state what it was trained on.")
     return [{**own, "split": checkpoint.split}, *before]
 
 
-def recorded_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | None:
-    """Return the split of the training run from its split.json, if the checkpoint still lies beside it."""
+def read_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | None:
+    """Read split.json of the training run, None if the checkpoint was moved out of it."""
     file = checkpoint.run / "split.json" if checkpoint.run else None
     return load_split(file, datamodule.store.records) if file and file.is_file() else None
 
 
 def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *, subsets: tuple[str, ...]) -> None:
-    """Refuse a split that would judge a network by pairs it has seen, where the data is a set of its training.
+    """Refuse a split that evaluates a network on pairs it has seen.
 
-    Training pairs were seen, and for a test so were validation pairs: its best epoch was chosen by them.
+    A test must not contain validation pairs either: the best epoch was chosen on them.
 
     Args:
         checkpoint: the network, or what it starts from.
         datamodule: with the split.
-        subsets: which of its subsets judge.
+        subsets: the subsets that evaluate the network.
 
     Raises:
         DataError: if a pair is in both.
@@ -53,48 +53,46 @@ def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *
         if past.get("fingerprint") != datamodule.store.info["fingerprint"]:
             if past.get("source") == datamodule.source.name:
                 log.warning(
-                    "'%s' was trained on another set of %s, or on other files of this one: if some of its pairs are "
-                    "among those that judge it now, nobody can tell",
+                    "'%s' was trained on another version of %s, so whether it has seen pairs of this one cannot be "
+                    "checked",
                     checkpoint.path, past["source"],
                 )  # fmt: skip
             continue
-        trained = (recorded_split(checkpoint, datamodule) if number == 0 else None) or _split_again(past, datamodule)
-        looks = [(subset, trained.train, "trained on") for subset in subsets]
-        looks += [("test", trained.val, "validated on")] if "test" in subsets else []
-        for subset, seen, how in looks:
-            shared = set(seen) & set(datamodule.split[subset])
-            if shared:
-                name = {"val": "validation"}.get(subset, subset)
-                raise DataError(
-                    f"data.split={datamodule.split.kind}: {len(shared)} of {len(datamodule.split[subset])} {name} "
-                    f"pairs were {how}, under data.split={trained.kind}. "
-                    + (
-                        "Leave data.split out to test on what was held out."
-                        if subsets == ("test",)
-                        else "Pass the same data.split, or init=null."
-                    )
-                )
+        trained = (read_split(checkpoint, datamodule) if number == 0 else None) or _remake_split(past, datamodule)
+        for subset in subsets:
+            _refuse_shared(datamodule.split, subset, trained.train, f"trained on, under data.split={trained.kind}")
+        if "test" in subsets:
+            _refuse_shared(datamodule.split, "test", trained.val, f"validated on, under data.split={trained.kind}")
 
 
-def _split_again(past: Mapping[str, Any], datamodule: DepthDataModule) -> Split:
-    """Make the split of a training again, as its checkpoint describes it."""
+def _refuse_shared(split: Split, subset: str, seen: Sequence[int], how: str) -> None:
+    shared = set(seen) & set(split[subset])
+    if shared:
+        name = {"val": "validation"}.get(subset, subset)
+        raise DataError(
+            f"data.split={split.kind}: {len(shared)} of {len(split[subset])} {name} pairs were {how}. "
+            "Leave data.split out to test on held-out pairs; in training, pass the same data.split or init=null."
+        )
+
+
+def _remake_split(past: Mapping[str, Any], datamodule: DepthDataModule) -> Split:
     try:
         split = past["split"]
         kind, seed, fractions = str(split["kind"]), int(split["seed"]), [float(share) for share in split["fractions"]]
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            "checkpoint, init: a training on this very data is named without its split, so what was trained on cannot "
-            "be told. Pass another checkpoint, or init=null."
+            "checkpoint, init: it was trained on this data, but does not state the split, so the training pairs are "
+            "unknown. Pass another checkpoint, or init=null."
         ) from error
     return make_split(datamodule.store.records, kind=kind, seed=seed, fractions=fractions)
 
 
 def note_scored(checkpoint: Checkpoint, datamodule: DepthDataModule, protocols: Sequence[Protocol]) -> list[int] | None:
-    """Note in the run that its test images are looked at.
+    """Record in the run that its network was evaluated on test images.
 
     Returns:
-        The other epochs that were scored on them before. None: this cannot be told, since the file was moved away from
-        its run, or nothing can be written there.
+        The run's other epochs that were evaluated on them before; None if unknown, because the checkpoint was moved
+        out of its run or the run cannot be written.
     """
     if checkpoint.run is None:
         return None
@@ -107,5 +105,5 @@ def note_scored(checkpoint: Checkpoint, datamodule: DepthDataModule, protocols: 
             protocols=[protocol.name for protocol in protocols],
         )
     except OSError as error:
-        log.warning("'%s' cannot note that its test images were looked at (%s)", checkpoint.run, error.strerror)
+        log.warning("'%s' cannot record this evaluation on test images (%s)", checkpoint.run, error.strerror)
         return None

@@ -36,7 +36,7 @@ def run_panels(
     """
     checkpoint = load_checkpoint(str(run))
     typed = {"cache": config["paths"]["cache"], **config["data"]}
-    datamodule, _ = open_data(checkpoint, typed, overrides=[], trust=config["trust"])
+    datamodule, _ = open_data(checkpoint, typed, trust=config["trust"])
     net = checkpoint.build_net(trust=config["trust"])
     return make_panels(net, datamodule.store, choose(datamodule), max_depth_m=datamodule.max_depth_m)
 

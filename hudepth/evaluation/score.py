@@ -1,85 +1,83 @@
-"""Scoring a checkpoint: the part that ``hudepth-test`` shares with the end of a training."""
+"""Scoring a checkpoint under test protocols: what hudepth-test does, and hudepth-train at its end."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 from torch import nn
 
 from hudepth.base.console import log, shows_progress
 from hudepth.base.devices import build_trainer, check_shares, without_known_warnings
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import write_json, write_text
-from hudepth.base.options import whole_number
+from hudepth.base.options import Range, output_folder
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
 from hudepth.evaluation.lineage import note_scored
+from hudepth.evaluation.outputs import Metrics, write_outputs
 from hudepth.evaluation.pictures import evenly_spaced, make_panels
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.routine import Evaluation
-from hudepth.evaluation.scoring import image_table
-from hudepth.evaluation.tables import print_results
-from hudepth.metrics.bootstrap import describe, intervals
-from hudepth.metrics.protocol import Protocol
-from hudepth.metrics.strata import strata_csv, summarise_strata
-from hudepth.metrics.summary import ImageTable, per_image_csv, summarise
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint
 from hudepth.runs.results import MODEL
 from hudepth.viz.panels import save_panels
-from hudepth.viz.strata import save_strata
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """Options of a test."""
+
+    trainer: Mapping[str, Any]
+    """Arguments of Lightning's Trainer."""
+    protocol: Mapping[str, Any]
+    """Configurations of the test protocols, by name."""
+    trust: list[str]
+    """Packages whose classes a configuration may name."""
+    panels: Annotated[int, Range(0)] = 6
+    """Rows of panels.png; 0: none."""
+    baselines: bool = True
+    """Whether to score trivial baselines too."""
 
 
 def score_checkpoint(
-    checkpoint: Checkpoint, *, config: dict[str, Any], output: Path, datamodule: DepthDataModule
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Score a checkpoint and trivial baselines in one pass; write a folder a protocol; print a table each.
+    checkpoint: Checkpoint, options: ScoreOptions, *, output: Path, datamodule: DepthDataModule
+) -> dict[str, Metrics]:
+    """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol.
 
     Args:
         checkpoint: what to score.
-        config: with ``trainer``, ``protocol``, ``trust`` and perhaps ``panels`` and ``baselines``.
-        output: folder for ``<protocol>/metrics.json``, ``per_image.csv``, ``panels.png`` and, where the protocol asks
-            for them, ``strata.csv`` and ``strata.png``.
+        options: how.
+        output: folder for ``<protocol>/metrics.json``, ``per_image.csv``, ``panels.png`` and, if the protocol asks for
+            them, ``strata.csv`` and ``strata.png``.
         datamodule: with the split to test on.
 
     Returns:
-        Metrics by protocol, predictor and name.
+        Metrics by protocol, predictor and name; empty except in the first process.
 
     Raises:
         HudepthError: with one line for the user.
     """
-    count = whole_number(config, "panels", default=6)
-    protocols = build_protocols(config["protocol"], datamodule=datamodule, trust=config["trust"])
-    try:
-        output.mkdir(parents=True, exist_ok=True)  # not after the work is done
-    except OSError as error:
-        raise ConfigError(f"output: cannot make '{output}' ({error.strerror}). Pass output=<a folder>.") from error
-    net = checkpoint.build_net(trust=config["trust"])
-    predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
-    if config.get("baselines", True):
-        predictors |= trivial_baselines(datamodule.store, datamodule.split.train, max_depth_m=datamodule.max_depth_m)
+    protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
+    output_folder(output)
+    predictors = _build_predictors(checkpoint, options, datamodule)
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m, detailed=MODEL)
-    with without_known_warnings():
-        trainer = _trainer(config["trainer"])
-        check_shares(trainer, subset="test", pairs=len(datamodule.split.test))
-        trainer.test(evaluation, datamodule=datamodule, verbose=False)
-    if not trainer.is_global_zero:
+    if not run_evaluation(evaluation, datamodule, options.trainer):
         return {}
-    shared = _stamp(checkpoint, datamodule)
-    shared["checkpoint"]["scored_before"] = note_scored(checkpoint, datamodule, protocols)
-    results, failed = {}, []
+    stamp = _stamp(checkpoint, datamodule)
+    stamp["checkpoint"]["scored_before"] = note_scored(checkpoint, datamodule, protocols)
+    results: dict[str, Metrics] = {}
+    failed = []
     for protocol in protocols:
         try:
-            results[protocol.name] = _write_results(output / protocol.name, protocol, evaluation, datamodule, shared)
-        except ConfigError as error:  # what the other protocols say is not lost
+            results[protocol.name] = write_outputs(output / protocol.name, protocol, evaluation, datamodule, stamp)
+        except ConfigError as error:  # the results of the other protocols are not lost
             failed.append(error)
-    if count:
-        shown = evenly_spaced(evaluation.indices, count)
+    if options.panels:
+        shown = evenly_spaced(evaluation.indices, options.panels)
         panels = make_panels(predictors[MODEL], datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
         for name in results:
             save_panels(output / name / "panels.png", panels)
@@ -89,81 +87,45 @@ def score_checkpoint(
     return results
 
 
-def _write_results(
-    folder: Path, protocol: Protocol, evaluation: Evaluation, datamodule: DepthDataModule, shared: Mapping[str, Any]
-) -> dict[str, dict[str, float]]:
-    """Summarise, write and print what one protocol says; return its metrics by predictor."""
-    records = [datamodule.store.records[index] for index in evaluation.indices]
-    tables = {}
-    for name in evaluation.predictors:
-        tables[name] = image_table(
-            protocol, evaluation.sums[name, protocol.name], records,
-            boundary=evaluation.boundary.get(protocol.name) if name == MODEL else None,
-        )  # fmt: skip
-    model = tables[MODEL]
-    left_out = _left_out(protocol, model)
-    metrics = {name: summarise(table, **protocol.summary_options) for name, table in tables.items()}
-    ranges = {name: intervals(table, **protocol.summary_options) for name, table in tables.items()}
-    write_json(
-        folder / "metrics.json",
-        {
-            "metrics": {who: {k: _finite(v) for k, v in row.items()} for who, row in metrics.items()},
-            "intervals": {
-                who: {k: [_finite(low), _finite(high)] for k, (low, high) in row.items()}
-                for who, row in ranges.items()
-            },
-            "uncertainty": describe(model),
-            "images": len(records),
-            "left_out": left_out,
-            "protocol": protocol.stamp(),
-            **shared,
-        },
-    )  # fmt: skip
-    write_text(folder / "per_image.csv", per_image_csv(model))
-    title = f"{protocol.name} protocol, {len(records) - len(left_out)} test images of {datamodule.source.name}"
-    if protocol.alignment != "none":
-        title += f", each prediction aligned to its truth ({protocol.alignment})"
-    if protocol.strata:
-        rows = summarise_strata(evaluation.strata[protocol.name], model.categories)
-        write_text(folder / "strata.csv", strata_csv(rows))
-        save_strata(folder / "strata.png", rows, title=title)
-    over = f"{describe(model)['scenes']} {'scenes' if any(model.scenes) else 'images, whose scenes are unknown'}"
-    print_results(metrics, ranges[MODEL], over=over, title=title)
-    return metrics
+def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options: Mapping[str, Any]) -> bool:
+    """Run an evaluation over the test subset; return whether this is the first process, which has the results.
 
-
-def _left_out(protocol: Protocol, table: ImageTable) -> list[str]:
-    """Name the images of which no pixel counts, in a line of the log.
+    Args:
+        evaluation: what to run.
+        datamodule: with the test subset.
+        options: arguments of Lightning's Trainer; one device by default.
 
     Raises:
-        ConfigError: if that is all of them.
+        ConfigError: if the devices are not available.
     """
-    ids = [image for image, pixels in zip(table.ids, table.pixels.tolist(), strict=True) if not pixels]
-    if len(ids) == len(table.ids):
-        raise ConfigError(f"protocol={protocol.name}: no pixel of {len(ids)} images counts; look at its crop and caps.")
-    if ids:
-        log.warning(
-            "protocol=%s: no pixel of %d of %d images counts (its holes, the caps, or a crop that exceeds it); "
-            "left out, the first is '%s'",
-            protocol.name, len(ids), len(table.ids), ids[0],
-        )  # fmt: skip
-    return ids
+    with without_known_warnings():
+        trainer = build_trainer(
+            {"devices": 1, **options},
+            logger=False,
+            callbacks=[RichProgressBar()] if shows_progress() else None,
+            enable_checkpointing=False,
+            enable_model_summary=False,
+            enable_progress_bar=shows_progress(),
+            use_distributed_sampler=False,
+            inference_mode=True,
+        )
+        check_shares(trainer, subset="test", pairs=len(datamodule.split.test))
+        trainer.test(evaluation, datamodule=datamodule, verbose=False)
+    return trainer.is_global_zero
 
 
-def _trainer(options: dict[str, Any]) -> Trainer:
-    return build_trainer(
-        {"devices": 1, **options},
-        logger=False,
-        callbacks=[RichProgressBar()] if shows_progress() else None,
-        enable_checkpointing=False,
-        enable_model_summary=False,
-        enable_progress_bar=shows_progress(),
-        use_distributed_sampler=False,
-        inference_mode=True,
-    )
+def _build_predictors(
+    checkpoint: Checkpoint, options: ScoreOptions, datamodule: DepthDataModule
+) -> dict[str, nn.Module]:
+    net = checkpoint.build_net(trust=options.trust)
+    predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
+    if options.baselines:
+        predictors |= trivial_baselines(datamodule.store, datamodule.split.train, max_depth_m=datamodule.max_depth_m)
+    return predictors
 
 
 def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any]:
+    """Return what metrics.json states about data, split and checkpoint."""
     info = datamodule.store.info
     return {
         "data": {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes", "skipped")},
@@ -176,7 +138,3 @@ def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any
             "trained_on": {**checkpoint.data, "split": checkpoint.split},
         },
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
-from rich.console import Console
-from rich.table import Table
+from hudepth.base.tables import Cell, Table, stdout
+from hudepth.metrics.catalogue import Level, metric_info, metric_names
 
-from hudepth.metrics.summary import higher_is_better
-
-SHOWN = ("abs_rel", "sq_rel", "rmse", "rmse_log", "log10", "silog", "mae", "ssim", "delta1", "delta2", "delta3")
-NARROW = ("abs_rel", "rmse", "log10", "ssim", "delta1", "delta2", "delta3")
-"""Columns of the printed table, in a terminal wide enough for all and in others; metrics.json always has all."""
-EDGES = ("edge_f1_0.25", "edge_f1_0.5", "edge_f1_1", "si_boundary_f1", "dbe_acc_px", "dbe_comp_px")
-"""What is shown of the boundary metrics."""
+LEVELS: tuple[Level, ...] = ("wide", "narrow", "headline")
+"""Columns of the printed table; the first level that fits the terminal. metrics.json always has all metrics."""
 
 
 def print_results(
     metrics: Mapping[str, Mapping[str, float]], ranges: Mapping[str, tuple[float, float]], *, over: str, title: str
 ) -> None:
-    """Print metrics, a row a predictor, the best of each column bold, and the intervals of the first predictor.
+    """Print metrics, one row per predictor, the best of each column bold, with the first predictor's intervals.
 
     Args:
         metrics: by predictor and name.
@@ -28,48 +22,46 @@ def print_results(
         over: what was resampled, for example ``215 scenes``.
         title: above the table.
     """
-    out = Console()
-    if not out.is_terminal:
-        out = Console(width=130)  # a log should not wrap what a wide terminal would show
     first = next(iter(metrics))
-    names = SHOWN if out.width >= 118 else NARROW
-    caption = f"rmse and mae in metres; delta and ssim: higher is better; intervals: bootstrap over {over}"
-    table = _table(title, caption, names)
-    for who in metrics:
-        table.add_row(who.replace("_", " "), *(_cell(metrics, who, name) for name in names))
-        if who == first:
+    caption = f"95 %: bootstrap over {over}"
+    _print_widest([make_table(metrics, ranges, metric_names(level), title, caption) for level in LEVELS])
+    if edges := metric_names("edges", among=metrics[first]):
+        chosen = [edges, metric_names("edge", among=edges)]
+        only = {first: metrics[first]}
+        _print_widest([make_table(only, ranges, names, "depth edges of the model", "") for names in chosen])
+
+
+def make_table(
+    metrics: Mapping[str, Mapping[str, float]],
+    ranges: Mapping[str, tuple[float, float]],
+    names: Sequence[str],
+    title: str,
+    caption: str,
+) -> Table:
+    """Return a table of some metrics; other arguments as for :func:`print_results`."""
+    infos = [metric_info(name) for name in names]
+    rising = ", ".join(info.name for info in infos if info.higher_is_better)
+    caption = "; ".join(filter(None, [f"higher is better: {rising}" if rising else "", caption]))
+    table = Table(["", *(info.label for info in infos)], title=title, caption=caption)
+    best = {
+        info.name: (max if info.higher_is_better else min)(row[info.name] for row in metrics.values())
+        for info in infos
+    }  # fmt: skip
+    for number, (who, row) in enumerate(metrics.items()):
+        cells = [
+            Cell(info.format(row[info.name]), bold=len(metrics) > 1 and row[info.name] == best[info.name])
+            for info in infos
+        ]
+        table.add(who.replace("_", " "), *cells)
+        if number == 0:
             for word, side in (("  95 % from", 0), ("       to", 1)):
-                table.add_row(word, *(_number(ranges[name][side]) for name in names), style="dim")
-    out.print(table)
-    if any(name in metrics[first] for name in EDGES):
-        _print_edges(out, metrics[first], ranges)
-
-
-def _print_edges(out: Console, row: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]) -> None:
-    names = [name for name in EDGES if name in row]
-    table = _table("depth edges of the model", "f1: higher is better; dbe: distance in pixels, lower is better", names)
-    table.add_row("model", *(_number(row[name]) for name in names))
-    for word, side in (("  95 % from", 0), ("       to", 1)):
-        table.add_row(word, *(_number(ranges[name][side]) for name in names), style="dim")
-    out.print(table)
-
-
-def _table(title: str, caption: str, names: Sequence[str]) -> Table:
-    table = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
-    table.add_column("")
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
+                table.add(Cell(word, dim=True), *(Cell(i.format(ranges[i.name][side]), dim=True) for i in infos))
     return table
 
 
-def _cell(metrics: Mapping[str, Mapping[str, float]], who: str, name: str) -> str:
-    column = [row[name] for row in metrics.values()]
-    best = max(column) if higher_is_better(name) else min(column)
-    text = _number(metrics[who][name])
-    return f"[bold]{text}[/]" if metrics[who][name] == best and len(metrics) > 1 else text
-
-
-def _number(value: float) -> str:
-    if math.isnan(value):
-        return "-"
-    return f"{value:.3f}" if value < 100 else f"{value:.1f}"
+def _print_widest(tables: Sequence[Table]) -> None:
+    """Print the first table that fits the terminal, else the last."""
+    console = stdout()
+    built = [table.to_rich() for table in tables]
+    fitting = (table for table in built if console.measure(table).maximum <= console.width)
+    console.print(next(fitting, built[-1]))

@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hudepth.base.console import log
 from hudepth.base.errors import CheckpointError, ConfigError, DataError, did_you_mean
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
-from hudepth.evaluation.lineage import recorded_split, refuse_training_pairs
+from hudepth.evaluation.lineage import read_split, refuse_training_pairs
 from hudepth.runs.checkpoint import Checkpoint
 
 
 def open_data(
-    checkpoint: Checkpoint, typed: dict[str, Any], *, overrides: list[str], trust: list[str]
+    checkpoint: Checkpoint, overrides: Mapping[str, Any], *, typed: Sequence[str] = (), trust: list[str]
 ) -> tuple[DepthDataModule, bool]:
-    """Return the data to test a checkpoint on, with the very split it was trained with, or another set.
+    """Return the data to test a checkpoint on, with the split it was trained with, or another data set.
 
     Args:
-        checkpoint: says what it was trained on.
-        typed: keys of ``data`` that stand above the checkpoint's, ``cache`` among them.
-        overrides: the command line.
+        checkpoint: states what it was trained on.
+        overrides: keys of ``data`` that replace the checkpoint's, ``cache`` among them; with ``_target_``, another
+            data set.
+        typed: command-line overrides, which tell a chosen size from the data set's default.
         trust: packages whose classes the configuration may name.
 
     Returns:
-        The data, and whether it is another set or split than that of the training.
+        The data, and whether data set or split differ from those of the training.
 
     Raises:
-        HudepthError: if it cannot be built, or test pairs were trained on.
+        HudepthError: if it cannot be built, or if test pairs were trained on.
     """
-    datamodule = build_data(_data_config(checkpoint, typed, overrides), trust=trust)
-    other_data = "_target_" in typed or any(key.startswith(("split", "fractions")) for key in typed)
+    datamodule = build_data(_data_config(checkpoint, overrides, typed), trust=trust)
+    other_data = "_target_" in overrides or any(key.startswith(("split", "fractions")) for key in overrides)
     if other_data:
         refuse_training_pairs(checkpoint, datamodule, subsets=("test",))
     else:
@@ -38,44 +40,39 @@ def open_data(
     return datamodule, other_data
 
 
-def _data_config(checkpoint: Checkpoint, typed: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
-    """Return the data configuration to test on: the checkpoint's with what was typed, or another set's.
-
-    A network keeps the input size it was trained at, unless another is typed, and the scale of its output in any case.
-    """
+def _data_config(checkpoint: Checkpoint, overrides: Mapping[str, Any], typed: Sequence[str]) -> dict[str, Any]:
+    """Return the data to test on, at the input size of the training unless overridden, and always at its scale."""
     trained = checkpoint.config.get("data")
     if not isinstance(trained, dict):
-        raise CheckpointError(f"'{checkpoint.path}' does not say what data it was trained on.")
-    if "_target_" in typed:
-        keys = {override.lstrip("+").partition("=")[0] for override in overrides}
-        data = {**typed, **{k: trained[k] for k in ("size", "max_depth_m") if k in trained and f"data.{k}" not in keys}}
+        raise CheckpointError(f"'{checkpoint.path}' does not state what data it was trained on. Pass another.")
+    if "_target_" in overrides:
+        keys = {override.lstrip("+").partition("=")[0] for override in typed}
+        kept = [key for key in ("size", "max_depth_m") if key in trained and f"data.{key}" not in keys]
+        data = {**overrides, **{key: trained[key] for key in kept}}
     else:
-        unknown = [key for key in typed if key not in trained]
-        if unknown:
+        if unknown := [key for key in overrides if key not in trained]:
             raise ConfigError(
                 f"data.{unknown[0]}: the checkpoint's data has no such key.{did_you_mean(unknown[0], trained)} "
                 "To test on another data set pass data=<name>."
             )
-        source = {**trained.get("source", {}), **typed.get("source", {})}
-        data = {**trained, **typed, "source": source}
-    if data.get("max_depth_m") != trained.get("max_depth_m"):
+        data = {**trained, **overrides, "source": {**trained.get("source", {}), **overrides.get("source", {})}}
+    before_m, now_m = trained.get("max_depth_m"), data.get("max_depth_m")
+    if before_m != now_m:
         raise ConfigError(
-            f"data.max_depth_m: the network was trained for {trained.get('max_depth_m')} m and answers in shares of "
-            f"it, not of {data.get('max_depth_m')} m. Leave data.max_depth_m out."
+            f"data.max_depth_m: the network was trained for {before_m} m, which scales its output, not for {now_m} m. "
+            "Leave data.max_depth_m out."
         )
     return data
 
 
 def _restore_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> None:
-    """Use the very split of the training run: from its split.json, else made again and compared by hash."""
-    recorded = recorded_split(checkpoint, datamodule)
-    if recorded:
-        datamodule.split = recorded
+    """Use the split of the training: from its split.json, else made again and compared by hash."""
+    datamodule.split = read_split(checkpoint, datamodule) or datamodule.split
     if datamodule.store.info["fingerprint"] != checkpoint.data.get("fingerprint"):
         log.warning("the files of %s have changed since the checkpoint was trained", datamodule.source.name)
     if datamodule.split.sha256 != checkpoint.split.get("sha256"):
         raise DataError(
-            f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained on, so "
-            "test pairs may have been trained on. "
+            f"'{checkpoint.path}': the split of {datamodule.source.name} is not the one it was trained with, so test "
+            "pairs may have been trained on. "
             "Pass the data.root it was trained on, or data=<name> to test on other data."
         )

@@ -80,7 +80,7 @@ def find_images(
 
 def _open_data(checkpoint: Checkpoint, data: Mapping[str, Any], trust: list[str]) -> DepthDataModule | None:
     try:
-        datamodule, _ = open_data(checkpoint, dict(data), overrides=[], trust=trust)
+        datamodule, _ = open_data(checkpoint, data, trust=trust)
         _ = datamodule.store
     except HudepthError as error:
         if data.keys() - {"cache"}:  # a data set that the user names must be there

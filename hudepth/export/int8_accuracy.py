@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import RichProgressBar
 from torch import Tensor, nn
 
-from hudepth.base.console import shows_progress
-from hudepth.base.devices import build_trainer, without_known_warnings
 from hudepth.base.normalise import denormalise_image
 from hudepth.base.tables import Table
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.lineage import note_scored
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.routine import Evaluation
+from hudepth.evaluation.score import run_evaluation
 from hudepth.evaluation.scoring import image_table
 from hudepth.inference.backends import Backend, TorchBackend
 from hudepth.metrics.bootstrap import paired_differences
@@ -70,13 +68,7 @@ def measure_int8(
     built = build_protocols(protocols, datamodule=datamodule, trust=trust)
     predictors: dict[str, nn.Module] = {FLOAT: reference.pipeline.net, INT8: _BackendNet(quantised)}
     evaluation = Evaluation(predictors, built, max_depth_m=datamodule.max_depth_m)
-    with without_known_warnings():
-        trainer = build_trainer(
-            {"accelerator": "cpu", "devices": 1},
-            logger=False, enable_checkpointing=False, enable_model_summary=False, inference_mode=True,
-            enable_progress_bar=shows_progress(), callbacks=[RichProgressBar()] if shows_progress() else None,
-        )  # fmt: skip
-        trainer.test(evaluation, datamodule=datamodule, verbose=False)
+    run_evaluation(evaluation, datamodule, {"accelerator": "cpu"})
     note_scored(checkpoint, datamodule, built)
     records = [datamodule.store.records[index] for index in evaluation.indices]
     changes: dict[str, Any] = {}

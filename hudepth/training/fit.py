@@ -16,12 +16,13 @@ from hudepth.base.devices import check_shares, is_first_process, without_known_w
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.instantiate import has_target, instantiate
 from hudepth.base.machine import keep_freed_memory
+from hudepth.base.options import parse
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE
 from hudepth.evaluation.protocols import build_protocols
-from hudepth.evaluation.score import score_checkpoint
+from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint
@@ -195,7 +196,6 @@ def run_epochs(training: Training, trainer: Trainer, module: DepthModule, data: 
 
 def score_best(training: Training, data: DepthDataModule) -> None:
     """Test the best checkpoint like hudepth-test does: on one device, in full precision."""
-    options = {**training.config, "trainer": {"accelerator": training.config["trainer"]["accelerator"]}}
-    score_checkpoint(
-        load_checkpoint(str(training.path)), config=options, output=training.path / "test", datamodule=data
-    )
+    trainer = {"accelerator": training.config["trainer"]["accelerator"]}
+    options = parse(ScoreOptions, {**training.config, "trainer": trainer})
+    score_checkpoint(load_checkpoint(str(training.path)), options, output=training.path / "test", datamodule=data)
