@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from rich.box import SIMPLE_HEAD
+from rich.measure import Measurement
+
 from hudepth.base.tables import Cell, Table, stdout
 from hudepth.metrics.catalogue import Level, metric_info, metric_names
 
@@ -62,6 +65,7 @@ def make_table(
 def _print_widest(tables: Sequence[Table]) -> None:
     """Print the first table that fits the terminal, else the last."""
     console = stdout()
-    built = [table.to_rich() for table in tables]
-    fitting = (table for table in built if console.measure(table).maximum <= console.width)
+    built = [table.to_rich(box=SIMPLE_HEAD, show_edge=False, pad_edge=False) for table in tables]
+    unbounded = console.options.update(width=1000)
+    fitting = (table for table in built if Measurement.get(console, unbounded, table).maximum <= console.width)
     console.print(next(fitting, built[-1]))
