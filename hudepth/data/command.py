@@ -10,7 +10,7 @@ from rich.table import Table
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import plain
-from hudepth.data.audit.audit import audit
+from hudepth.data.audit.run_audit import audit
 from hudepth.data.build import build_data
 from hudepth.data.prepare import store_path
 from hudepth.data.splits import SUBSETS, make_split

@@ -1,25 +1,27 @@
-"""How near test frames lie to training frames, counted from records alone: no image is opened."""
+"""What a split leaks: how close test frames are to training frames, counted from records, and the worst pairs."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.data.audit.duplicates import NEAR_BITS, Duplicates, find_nearest_hashes
 from hudepth.data.sources.base import Record
 from hudepth.data.splits import Split
 
 WITHIN = (1, 2, 5)
 """Distances [frames] up to which a training frame counts as a neighbour."""
 UNKNOWN = -1
-"""Distance of two frames of different scenes, or of a frame whose scene has no name."""
+"""Distance between frames of different scenes, or of a frame whose scene has no name."""
 
 
 @dataclass(frozen=True)
 class Leakage:
-    """What a split lets a network see of the scenes of its test frames.
+    """How much of the test frames' scenes training sees.
 
     Shares are of the test frames whose scene has a name, NaN if there are none.
     """
@@ -36,6 +38,32 @@ class Leakage:
     """Mean distance to the nearest training frame of the scene, over test frames that have one; else NaN."""
 
 
+@dataclass(frozen=True)
+class AuditedSplit:
+    """A split and what it leaks."""
+
+    split: Split
+    leak: Leakage
+    copies: Duplicates | None
+    """None if the images were not read."""
+
+
+@dataclass(frozen=True)
+class Leak:
+    """A test image and the training image that gives it away, by position in the store."""
+
+    test: int
+    train: int
+    equal: bool
+    """Whether their pixels are equal."""
+    near: bool
+    """Whether they are near duplicates."""
+    bits: int
+    """Bits in which their hashes differ."""
+    frames_apart: int | None
+    """None in different scenes."""
+
+
 class SceneOrder:
     """The place of each frame in its scene.
 
@@ -47,50 +75,39 @@ class SceneOrder:
         numbers: dict[str, int] = {}
         scenes = [numbers.setdefault(r.scene, len(numbers)) if r.scene else UNKNOWN for r in records]
         self.scene = np.array(scenes, np.int64)
-        """[n] number of each frame's scene, :data:`UNKNOWN` where it has no name."""
+        """[n] number of each frame's scene, :data:`UNKNOWN` if it has no name."""
         self._sorted = np.lexsort((np.array([record.frame for record in records], np.int64), self.scene))
         self._place = np.empty(len(records), np.int64)  # in a line of all frames, scene after scene
         self._place[self._sorted] = np.arange(len(records))
 
     def distance(self, one: int, other: int) -> int:
-        """Return how many frames two frames are apart, :data:`UNKNOWN` unless they are of one scene."""
+        """Return how many frames two frames are apart, :data:`UNKNOWN` if they are not of one scene."""
         if self.scene[one] != self.scene[other] or self.scene[one] == UNKNOWN:
             return UNKNOWN
         return int(abs(self._place[one] - self._place[other]))
 
     def nearest(self, train: Sequence[int]) -> NDArray[np.int64]:
-        """Return how many frames each frame is from the nearest of ``train`` in its scene.
+        """Return the distance [n] of each frame from the nearest of ``train`` in its scene.
 
-        Args:
-            train: positions in the records.
-
-        Returns:
-            [n] distances, 0 for the frames of ``train``, :data:`UNKNOWN` where the scene has none of them.
+        It is 0 for the frames of ``train``, :data:`UNKNOWN` if the scene has none of them.
         """
         n = len(self.scene)
-        line, scene = np.arange(n), self.scene[self._sorted]
-        in_train = np.zeros(n, bool)
-        in_train[self._place[np.asarray(train, np.int64)]] = True
-        before = np.maximum.accumulate(np.where(in_train, line, -1))
-        after = np.minimum.accumulate(np.where(in_train, line, n)[::-1])[::-1]
-        distance = np.full(n, n)  # farther than any frame
-        for found in (before, after):
-            same = (found >= 0) & (found < n) & (scene >= 0) & (scene[found.clip(0, n - 1)] == scene)
-            distance = np.where(same, np.minimum(distance, np.abs(found - line)), distance)
-        result = np.empty(n, np.int64)
-        result[self._sorted] = np.where(distance < n, distance, UNKNOWN)
-        return result
+        if not len(train):
+            return np.full(n, UNKNOWN)
+        places = np.sort(self._place[np.asarray(train, np.int64)])
+        after = np.searchsorted(places, self._place)
+        distance = np.full(n, n)
+        for found in (places[(after - 1).clip(min=0)], places[after.clip(max=len(places) - 1)]):
+            same = (self.scene[self._sorted[found]] == self.scene) & (self.scene != UNKNOWN)
+            distance = np.where(same, np.minimum(distance, np.abs(found - self._place)), distance)
+        return np.where(distance < n, distance, UNKNOWN)
 
 
-def leakage(records: Sequence[Record], split: Split) -> Leakage:
-    """Count test frames near training frames of their scene.
+def measure_leakage(records: Sequence[Record], split: Split) -> Leakage:
+    """Count test frames near training frames of their scene; no image is read.
 
     Distances are between places in the scene: its frames, of all subsets, are sorted by number and counted off. Two
     frames are one apart if the set has none between them, however much of the video was dropped there.
-
-    Args:
-        records: those the split was made of.
-        split: positions in ``records``.
     """
     order = SceneOrder(records)
     test = np.asarray(split.test, np.int64)
@@ -105,3 +122,44 @@ def leakage(records: Sequence[Record], split: Split) -> Leakage:
         within={k: float((seen & (distance <= k)).mean()) if len(known) else nan for k in WITHIN},
         mean_distance_frames=float(distance[seen].mean()) if seen.any() else nan,
     )
+
+
+def find_worst_leaks(
+    records: Sequence[Record], split: Split, copies: Duplicates, hashes: NDArray[np.uint64], *, rows: int = 6
+) -> list[Leak]:
+    """Choose the test images that training gives away most, each with one training image.
+
+    That is the near duplicate if there is one, else the most similar training image of the same scene, else the most
+    similar of all. They come in this order, then by hash, then by distance; a scene comes a second time only after
+    all others have come once.
+
+    Args:
+        records: of the store.
+        split: positions in the store.
+        copies: duplicates of this split.
+        hashes: [n] of all images of the store.
+        rows: how many to choose.
+    """
+    order = SceneOrder(records)
+    train = np.asarray(split.train, np.int64)
+    train_scene = order.scene[train]
+    leaks = []
+    for row, test in enumerate(split.test):
+        nearest, bits = int(copies.nearest[row]), int(copies.bits[row])
+        same_scene = train[(train_scene == order.scene[test]) & (train_scene != UNKNOWN)]
+        if bits > NEAR_BITS and len(same_scene):
+            position, differing = find_nearest_hashes(hashes[[test]], hashes[same_scene])
+            nearest, bits = int(same_scene[position[0]]), int(differing[0])
+        frames = order.distance(test, nearest)
+        apart = None if frames == UNKNOWN else frames
+        leaks.append(Leak(test, nearest, bool(copies.equal[row]), bits <= NEAR_BITS, bits, apart))
+    leaks.sort(
+        key=lambda leak: (not leak.equal, not leak.near, leak.frames_apart is None, leak.bits, leak.frames_apart)
+    )
+    times: Counter[str] = Counter()
+    turns = []
+    for leak in leaks:
+        scene = records[leak.test].scene or records[leak.test].id
+        turns.append(times[scene])
+        times[scene] += 1
+    return [leaks[i] for i in np.argsort(turns, kind="stable")[:rows]]

@@ -1,106 +1,22 @@
-"""Leakage against plain loops and the chances of a random split; findings on sets made to have them."""
+"""Findings on sets made to have them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hudepth.base.errors import DataError
-from hudepth.data.audit.findings import Finding, depth_findings, sample_raw, scan_store, split_finding
-from hudepth.data.audit.hashes import Duplicates, perceptual_hashes, pixel_digests
+from hudepth.data.audit.duplicates import Duplicates
+from hudepth.data.audit.findings import Finding, judge_depth, judge_split
 from hudepth.data.audit.leakage import Leakage
+from hudepth.data.audit.scan import sample_raw, scan_store
 from hudepth.data.prepare import prepare
-from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.store import DepthStore
-
-PLACES = st.lists(
-    st.tuples(st.sampled_from(["", "a", "b", "c"]), st.integers(0, 9), st.sampled_from(["train", "val", "test"])),
-    min_size=1,
-    max_size=30,
-)
-
-
-class MadeUp(Source):
-    """Pairs given as arrays; None cannot be read."""
-
-    name: ClassVar[str] = "made_up"
-    auto_uint8: ClassVar[str | None] = "uint8_10m"
-
-    def __init__(self, depths: Sequence[NDArray[np.generic] | None], encoding: str = "auto") -> None:
-        self.depths, self.encoding = depths, encoding
-
-    def records(self) -> Sequence[Record]:
-        return [Record(id=f"p{i}", scene="a", frame=i) for i in range(len(self.depths))]
-
-    def read(self, record: Record) -> RawPair:
-        depth = self.depths[record.frame]
-        if depth is None:
-            raise DataError(f"'{record.id}': damaged.")
-        shade = np.full((*depth.shape, 3), 20 * (record.frame // 2 % 12), np.uint8)  # two images of each shade
-        return RawPair(shade, depth)
-
-
-def test_a_store_is_scanned_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hudepth.data.audit.findings.CHUNK", 2)
-    rng = np.random.default_rng(0)
-    depths = [rng.integers(1000, 5000, (8, 10)).astype(np.uint16) for _ in range(5)]
-    depths[1][:4] = 0
-    depths[3][:] = 2500
-    depths[4][:], depths[4][0, 0] = 3000, 0  # a hole is no second depth
-    store = prepare(MadeUp(depths), size=(8, 10), cache=tmp_path, workers=1)
-    scan = scan_store(store)
-    images, stored = store.read(range(5))
-    assert scan.hashes.tolist() == perceptual_hashes(images).tolist()
-    assert scan.digests == pixel_digests(images)
-    assert scan.histogram.tolist() == [int((stored == mm).sum()) for mm in range(1 << 16)]
-    assert scan.constant == [3, 4]
-
-
-def test_the_step_of_8_bits_is_39_mm() -> None:
-    ramp = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    found = sample_raw(source := MadeUp([ramp] * 3), source.records())
-    assert found.step_mm == pytest.approx(10_000 / 255, rel=1e-3)
-    assert found.levels == 255  # 0 is unmeasured
-    assert found.at_largest == pytest.approx(1 / 255)
-
-
-def test_the_raw_sample_is_a_median_over_readable_pairs() -> None:
-    depths = [np.array([[1000, 1000 + step, 9000]], np.uint16) for step in (5, 7, 100)]
-    source = MadeUp(
-        [None, depths[0], np.full((1, 3), 9000, np.uint16), depths[1], np.zeros((1, 3), np.uint16), depths[2]]
-    )
-    found = sample_raw(source, source.records())
-    assert found.step_mm == pytest.approx(7, rel=1e-4)
-    assert found.levels == 3
-    assert found.at_largest == pytest.approx((3 + 3) / 12)
-
-
-def test_a_sample_is_spread_over_the_set() -> None:
-    source = MadeUp([np.array([[i + 1, 2 * i + 2]], np.uint16) for i in range(100)])
-    read: list[int] = []
-
-    def listen(record: Record) -> RawPair:
-        read.append(record.frame)
-        return MadeUp.read(source, record)
-
-    source.read = listen  # type: ignore[method-assign]
-    sample_raw(source, source.records(), pairs=10)
-    assert read == list(range(0, 100, 10))
-
-
-def test_nothing_readable_gives_nan() -> None:
-    found = sample_raw(source := MadeUp([None]), source.records())
-    assert math.isnan(found.step_mm)
-    assert math.isnan(found.at_largest)
-    assert found.levels == 0
-
+from tests.data.audit.test_scan import MadeUp
 
 SCENE_SEEN = Leakage({"train": 7, "val": 1, "test": 2}, 0, 1.0, {1: 0.5, 2: 1.0, 5: 1.0}, 1.5)
 APART = Leakage({"train": 7, "val": 1, "test": 2}, 0, 0.0, {1: 0.0, 2: 0.0, 5: 0.0}, math.nan)
@@ -122,7 +38,7 @@ UNLIKE = Duplicates(0.0, 0.0, NOBODY, NOBODY, NOBODY > 0)
     ],
 )
 def test_what_is_said_of_a_split(leak: Leakage, copies: Duplicates | None, severity: str, text: str) -> None:
-    found = split_finding("random", leak, copies)
+    found = judge_split("random", leak, copies)
     assert found.severity == severity
     assert text in found.found
     assert found.about == "split=random"
@@ -142,7 +58,7 @@ def judge(tmp_path: Path) -> Judge:
         source.indoor = indoor
         store: DepthStore = prepare(source, size=(16, 20), cache=tmp_path, on_error="skip", workers=1)
         scan, raw = scan_store(store), sample_raw(source, source.records())
-        found = depth_findings(store, scan, raw, indoor=indoor, max_depth_m=max_depth_m)
+        found = judge_depth(store, scan, raw, indoor=indoor, max_depth_m=max_depth_m)
         return {finding.about: finding for finding in found}
 
     return run

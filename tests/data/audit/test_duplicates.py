@@ -12,15 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hudepth.data.audit import hashes as module
-from hudepth.data.audit.hashes import (
+from hudepth.data.audit.duplicates import (
     NEAR_BITS,
     count_bits,
-    count_bits_by_table,
+    digest_pixels,
     find_duplicates,
-    nearest_hashes,
-    perceptual_hashes,
-    pixel_digests,
+    find_nearest_hashes,
+    hash_images,
 )
 from hudepth.data.splits import Split
 
@@ -35,7 +33,7 @@ def scenes(n: int, *, seed: int = 0, size: tuple[int, int] = (96, 128)) -> NDArr
 
 
 def bits_apart(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> list[int]:
-    pairs = zip(perceptual_hashes(one).tolist(), perceptual_hashes(other).tolist(), strict=True)
+    pairs = zip(hash_images(one).tolist(), hash_images(other).tolist(), strict=True)
     return [(a ^ b).bit_count() for a, b in pairs]
 
 
@@ -47,7 +45,7 @@ def test_the_hash_is_the_sign_of_low_frequencies() -> None:
     images = scenes(5)
     k, x = np.arange(8)[:, None], np.arange(32)[None]
     basis = np.cos(np.pi * (2 * x + 1) * k / 64) * np.where(k == 0, np.sqrt(1 / 32), np.sqrt(2 / 32))
-    for image, found in zip(images, perceptual_hashes(images).tolist(), strict=True):
+    for image, found in zip(images, hash_images(images).tolist(), strict=True):
         grey = np.rint(image @ [0.299, 0.587, 0.114])  # 8 bits
         thumbnail = grey.reshape(32, 3, 32, 4).mean(axis=(1, 3))
         low = (basis @ thumbnail @ basis.T).ravel()
@@ -75,35 +73,33 @@ def test_unrelated_and_mirrored_images_are_far() -> None:
 
 def test_images_of_one_colour_have_one_hash() -> None:
     flat = np.stack([np.full((20, 30, 3), value, np.uint8) for value in (1, 90, 255)])
-    assert len(set(perceptual_hashes(flat).tolist())) == 1
+    assert len(set(hash_images(flat).tolist())) == 1
 
 
 def test_digests_are_equal_for_equal_pixels_alone() -> None:
     images = np.concatenate([scenes(3), scenes(3)])
     images[5, 0, 0, 0] ^= 1
-    first, second = pixel_digests(images)[:3], pixel_digests(images)[3:]
+    first, second = digest_pixels(images)[:3], digest_pixels(images)[3:]
     assert [a == b for a, b in zip(first, second, strict=True)] == [True, True, False]
     assert len(set(first)) == 3
-    assert pixel_digests(images[:, ::2]) == pixel_digests(np.ascontiguousarray(images[:, ::2]))
+    assert digest_pixels(images[:, ::2]) == digest_pixels(np.ascontiguousarray(images[:, ::2]))
 
 
+@pytest.mark.parametrize("numpy", [1, 2])
 @given(values=HASHES)
-def test_bits_are_counted_as_python_does(values: list[int]) -> None:
+def test_bits_are_counted_as_python_does(numpy: int, values: list[int]) -> None:
     array = np.array(values, np.uint64)
     expected = [value.bit_count() for value in values]
-    assert count_bits(array).tolist() == expected
-    assert count_bits_by_table(array).tolist() == expected
-    assert count_bits_by_table(array[None, ::-1]).tolist() == [expected[::-1]]
-
-
-def test_numpy_1_counts_by_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(np, "bitwise_count", raising=False)
-    assert module.count_bits(np.array([0, 7, 2**64 - 1], np.uint64)).tolist() == [0, 3, 64]
+    with pytest.MonkeyPatch.context() as patch:
+        if numpy == 1:  # counts by table
+            patch.delattr(np, "bitwise_count", raising=False)
+        assert count_bits(array).tolist() == expected
+        assert count_bits(array[None, ::-1]).tolist() == [expected[::-1]]
 
 
 @given(queries=HASHES, hashes=HASHES, block=st.integers(1, 40))
 def test_the_nearest_is_found_whatever_the_block(queries: list[int], hashes: list[int], block: int) -> None:
-    position, bits = nearest_hashes(np.array(queries, np.uint64), np.array(hashes, np.uint64), block=block)
+    position, bits = find_nearest_hashes(np.array(queries, np.uint64), np.array(hashes, np.uint64), block=block)
     for query, at, differing in zip(queries, position.tolist(), bits.tolist(), strict=True):
         distances = [(query ^ other).bit_count() for other in hashes]
         assert differing == min(distances)
@@ -141,7 +137,7 @@ def test_real_rooms_of_other_scenes_are_no_near_duplicates(nyu_root: Path) -> No
     with (nyu_root / "index.csv").open(encoding="utf-8", newline="") as file:
         rows = list({row["scene"]: row for row in csv.DictReader(file)}.values())[::12]
     images = np.stack([cv2.resize(cv2.imread(str(nyu_root / row["image"])), (224, 224)) for row in rows])
-    hashes = perceptual_hashes(images)
+    hashes = hash_images(images)
     apart = count_bits(hashes[:, None] ^ hashes)[np.triu_indices(len(rows), 1)]
     assert apart.min() > NEAR_BITS
     assert np.median(apart) == pytest.approx(32, abs=2)
