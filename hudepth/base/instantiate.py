@@ -41,6 +41,21 @@ def has_target(config: Mapping[str, Any] | None) -> bool:
     return bool(config and config.get("_target_"))
 
 
+def import_trusted(trust: Iterable[str]) -> None:
+    """Import the packages that the user trusts, so that they can register their metrics.
+
+    Raises:
+        ConfigError: if one cannot be imported.
+    """
+    for name in trust:
+        try:
+            importlib.import_module(name.rstrip("."))
+        except ImportError as error:
+            raise ConfigError(
+                f"trust: '{name}' cannot be imported ({error}). Pass trust=[<an installed package>]."
+            ) from error
+
+
 def _build(
     config: Any, prefixes: tuple[str, ...], only: type, args: tuple[Any, ...] = (), extra: Mapping[str, Any] = {}
 ) -> Any:

@@ -13,6 +13,7 @@ from torch import nn
 from hudepth.base.console import log, shows_progress
 from hudepth.base.devices import build_trainer, check_shares, without_known_warnings
 from hudepth.base.errors import ConfigError
+from hudepth.base.instantiate import import_trusted
 from hudepth.base.options import Range, output_folder
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
@@ -61,6 +62,7 @@ def score_checkpoint(
     Raises:
         HudepthError: with one line for the user.
     """
+    import_trusted(options.trust)
     protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
     output_folder(output)
     predictors = _build_predictors(checkpoint, options, datamodule)

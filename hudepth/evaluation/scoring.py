@@ -14,6 +14,7 @@ from hudepth.base.types import Batch
 from hudepth.data.sources.base import Record
 from hudepth.evaluation.grids import SUM_COLUMNS, Cache, Grid, Scored
 from hudepth.metrics.boundary import BOUNDARY_NAMES, boundary_metrics
+from hudepth.metrics.catalogue import registered_functions
 from hudepth.metrics.depth import depth_metrics_from_sums
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.strata import strata_sums
@@ -65,8 +66,18 @@ class BatchScores:
         self._cache = Cache()
 
     def sums(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
-        """Return a row of sums for each image, columns as in :data:`SUM_COLUMNS`."""
-        return torch.cat([scored.sums(protocol) for scored in self._scored(protocol)])
+        """Return a row of sums for each image: columns as in :data:`SUM_COLUMNS`, then registered metrics."""
+        rows = torch.cat([scored.sums(protocol) for scored in self._scored(protocol)])
+        return torch.cat([rows, *self._registered(protocol)], dim=1)
+
+    def _registered(self, protocol: Protocol) -> list[Tensor]:
+        """Compute metrics that were registered with a function, one column each."""
+        functions = registered_functions().values()
+        images = [*self._cropped(protocol)] if functions else []
+        return [
+            torch.cat([torch.where(x[2].any(dim=(1, 2, 3)), function(*x).double(), torch.nan) for x in images])[:, None]
+            for function in functions
+        ]
 
     def boundary(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
         """Return the boundary metrics of each image, columns as in :data:`hudepth.metrics.boundary.BOUNDARY_NAMES`."""
@@ -124,10 +135,10 @@ def image_table(
         records: the pair of each row.
         boundary: rows of :meth:`BatchScores.boundary`.
     """
-    columns = dict(zip(SUM_COLUMNS, sums.T, strict=True))
-    ssim = columns.pop("ssim")
+    columns = dict(zip((*SUM_COLUMNS, *registered_functions()), sums.T, strict=True))
+    others = {name: columns.pop(name) for name in ("ssim", *registered_functions())}
     values = depth_metrics_from_sums(columns, silog_lambda=protocol.silog_lambda, silog_factor=protocol.silog_factor)
-    values |= {LOG_BIAS: columns["log"] / columns["count"], "ssim": ssim}
+    values |= {LOG_BIAS: columns["log"] / columns["count"], **others}
     if boundary is not None:
         values |= dict(zip(BOUNDARY_NAMES, boundary.T, strict=True))
     return ImageTable(

@@ -1,17 +1,18 @@
-"""How sure a metric of a test set is: bootstrap over scenes.
+"""Confidence intervals of a test set's metrics: bootstrap over scenes.
 
 Frames of a scene resemble each other, so they are not independent draws; scenes are. Each repeat draws as many scenes
-as there are, with replacement, and takes the metrics of all their frames. The interval lies between two percentiles of
-the repeats, moved outwards for few scenes as if their mean followed Student's t (the expanded percentile interval of
+as there are, with replacement, and computes the metrics of all their frames. The interval lies between two percentiles
+of the repeats, moved outwards for few scenes as if their mean followed Student's t (the expanded percentile interval of
 Hesterberg 2015, What teachers should know about the bootstrap):
 
     p = Phi(-sqrt(n / (n - 1)) * t_(n - 1)),  n scenes, t the quantile that leaves (1 - level) / 2 above it
 
 In 8000 simulated sets of normal scene effects as large as the frames' own scatter, five frames a scene on average,
-intervals of 95 % held the truth in 91.5 % of sets of 5 scenes, 94.5 % of 12 and 94.3 % of 40 (not moved: 82.9 %, 91.1 %
-and 93.3 %; images resampled one by one: about 70 %). With log-normal errors it was 93 % at 12 scenes.
+95 % intervals contained the true value in 91.5 % of sets of 5 scenes, 94.5 % of 12 and 94.3 % of 40 (without the
+correction: 82.9 %, 91.1 % and 93.3 %; with images resampled one by one: about 70 %). With log-normal errors: 93 % of
+sets of 12 scenes.
 
-An interval says how much a result depends on which scenes were tested, not on the seed a network was trained with.
+An interval shows how much a result depends on which scenes were tested, not on the seed of the training.
 """
 
 from __future__ import annotations
@@ -19,26 +20,26 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from statistics import NormalDist
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
-from hudepth.metrics.student import student_quantile
-from hudepth.metrics.summary import Floats, ImageTable, additive, metrics_from_sums, summarise
+from hudepth.metrics.summary import Floats, ImageTable, SummaryOptions, additive, metrics_from_sums, summarise
 
 LEVEL = 0.95
 MIN_SCENES = 5
-"""Fewer scenes give no interval: no percentile of their means leaves their range, so with 4 it would hold the truth in
-88 % of sets, with 2 in half of them."""
+"""Fewer scenes give no interval: no percentile of their means leaves their range, so with 4 scenes it would contain the
+true value in 88 % of sets, with 2 in half of them."""
 REPEATS = 2000
 SEED = 0
 MOST_COUNTS = 1_000_000
-"""Draws are counted so many scenes at a time, so that thousands of scenes need no more memory than hundreds."""
+"""Scenes drawn at a time, which bounds the memory for thousands of scenes."""
 MOST_PRODUCTS = 200_000
-"""So many multiplications at a time: in larger products BLAS starts threads, which cost more than they bring."""
+"""Multiplications at a time: in larger products BLAS starts threads, which cost more than they gain."""
 
 
 @dataclass(frozen=True)
@@ -83,18 +84,14 @@ class Resampler:
         for part in np.array_split(np.arange(self.repeats), math.ceil(self.repeats * self._count / MOST_COUNTS)):
             yield generator.multinomial(self._count, share, size=len(part)).astype(np.float64)
 
-    def draws(
-        self, table: ImageTable, *, averaging: str, silog_lambda: float = 1.0, silog_factor: float = 100.0
-    ) -> Draws:
+    def draws(self, table: ImageTable, **options: Unpack[SummaryOptions]) -> Draws:
         """Return the metrics of the drawn sets.
 
         Args:
             table: of the same images, scenes and pixels in the same order as the resampler's.
-            averaging: as in :func:`hudepth.metrics.summary.summarise`, like the two that follow.
-            silog_lambda: see there.
-            silog_factor: see there.
+            **options: as in :func:`hudepth.metrics.summary.summarise`.
         """
-        columns = additive(table, averaging=averaging)
+        columns = additive(table, averaging=options["averaging"])
         # [scenes, 2 metrics]: sums of each scene, so that a draw costs scenes and not images
         flat = [row[self._counted] for column in columns.values() for row in column]
         per_scene = np.stack([np.bincount(self._scene, weights=row, minlength=self._count) for row in flat], axis=1)
@@ -106,70 +103,46 @@ class Resampler:
                     drawn[start : start + len(part)] = part @ per_scene
                 start += len(part)
         sums = dict(zip(columns, drawn.reshape(self.repeats, -1, 2).transpose(1, 2, 0), strict=True))
-        metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
+        metrics = metrics_from_sums(sums, **options)
         defined = dict(zip(columns, np.count_nonzero(per_scene[:, 1::2], axis=0).tolist(), strict=True))
         return Draws(metrics, {name: defined[name] for name in metrics})
 
 
 def bootstrap(
-    table: ImageTable,
-    *,
-    averaging: str,
-    silog_lambda: float = 1.0,
-    silog_factor: float = 100.0,
-    repeats: int = REPEATS,
-    seed: int = SEED,
+    table: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, Floats]:
     """Return the metrics of resampled sets.
 
     Args:
         table: of the images; one whose scene is empty counts as a scene of its own.
-        averaging: as in :func:`hudepth.metrics.summary.summarise`, like the two that follow.
-        silog_lambda: see there.
-        silog_factor: see there.
         repeats: how many sets to draw.
         seed: of the draws. Tables of the same images get the same draws.
+        **options: as in :func:`hudepth.metrics.summary.summarise`.
 
     Returns:
         [repeats] by metric. NaN where a prediction was NaN, and in draws without an image that defines the metric.
     """
-    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
     return Resampler(table, repeats=repeats, seed=seed).draws(table, **options).metrics
 
 
 def intervals(
-    table: ImageTable,
-    *,
-    averaging: str,
-    silog_lambda: float = 1.0,
-    silog_factor: float = 100.0,
-    repeats: int = REPEATS,
-    seed: int = SEED,
+    table: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, tuple[float, float]]:
     """Return the interval of each metric, arguments as in :func:`bootstrap`.
 
     Returns:
         (low, high) by metric; NaN where a prediction was NaN or fewer than :data:`MIN_SCENES` scenes define the metric.
     """
-    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
     draws = Resampler(table, repeats=repeats, seed=seed).draws(table, **options)
     return {name: interval_of(values, draws.scenes[name]) for name, values in draws.metrics.items()}
 
 
 def paired_differences(
-    a: ImageTable,
-    b: ImageTable,
-    *,
-    averaging: str,
-    silog_lambda: float = 1.0,
-    silog_factor: float = 100.0,
-    repeats: int = REPEATS,
-    seed: int = SEED,
+    a: ImageTable, b: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, Difference]:
     """Return b - a of two results on the same images, both resampled with the same draws.
 
-    What makes an image hard is then part of both sides and falls out of the difference. Arguments as in
-    :func:`bootstrap`.
+    What makes an image hard then affects both sides and cancels. Arguments as in :func:`bootstrap`.
 
     Returns:
         For each metric of both; its interval is NaN as in :func:`intervals`.
@@ -182,39 +155,28 @@ def paired_differences(
             f"no paired comparison: the {len(a.ids)} and {len(b.ids)} rows are not of the same images, scenes and "
             "pixels in the same order. Compare them as different images."
         )
-    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
     resampler = Resampler(a, repeats=repeats, seed=seed)
-    draws = [resampler.draws(table, **options) for table in (a, b)]
-    return _differences(a, b, draws[0], draws[1], options)
+    return _differences(a, b, resampler.draws(a, **options), resampler.draws(b, **options), **options)
 
 
 def unpaired_differences(
-    a: ImageTable,
-    b: ImageTable,
-    *,
-    averaging: str,
-    silog_lambda: float = 1.0,
-    silog_factor: float = 100.0,
-    repeats: int = REPEATS,
-    seed: int = SEED,
+    a: ImageTable, b: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, Difference]:
     """Return b - a of two results on different images, as of two splits, each resampled on its own.
 
-    Wider than :func:`paired_differences`; and too narrow if sets that share scenes are passed. Arguments as in
-    :func:`bootstrap`.
+    Wider than :func:`paired_differences`, and too narrow for sets that share scenes. Arguments as in :func:`bootstrap`.
 
     Returns:
         For each metric of both; its interval is NaN as in :func:`intervals`.
     """
-    options: dict[str, Any] = {"averaging": averaging, "silog_lambda": silog_lambda, "silog_factor": silog_factor}
     draws = [
         Resampler(table, repeats=repeats, seed=[seed, i]).draws(table, **options) for i, table in enumerate((a, b))
     ]
-    return _differences(a, b, draws[0], draws[1], options)
+    return _differences(a, b, draws[0], draws[1], **options)
 
 
 def describe(table: ImageTable, *, repeats: int = REPEATS, seed: int = SEED) -> dict[str, Any]:
-    """Return what intervals rest on, for a metric file."""
+    """Return how intervals are made, for a metric file."""
     return {
         "method": "expanded percentile bootstrap by scene",
         "level": LEVEL,
@@ -234,7 +196,7 @@ def _scenes(table: ImageTable) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
 
 
 def _differences(
-    a: ImageTable, b: ImageTable, draws_a: Draws, draws_b: Draws, options: dict[str, Any]
+    a: ImageTable, b: ImageTable, draws_a: Draws, draws_b: Draws, **options: Unpack[SummaryOptions]
 ) -> dict[str, Difference]:
     before, after = (summarise(table, **options) for table in (a, b))
     differences = {}
@@ -246,12 +208,25 @@ def _differences(
     return differences
 
 
+@cache
+def student_quantile(freedom: int, *, level: float = LEVEL) -> float:
+    """Return the t of Student's distribution for which [-t, t] has probability ``level``.
+
+    Args:
+        freedom: degrees of freedom, at least 1.
+        level: between 0 and 1.
+    """
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.5 + level / 2))
+
+
 def interval_of(values: Floats, scenes: int) -> tuple[float, float]:
     """Return the expanded percentile interval of draws.
 
     Args:
-        values: [repeats] a metric, or a difference, of the drawn sets; those that are NaN for want of an image that
-            defines the metric are left out.
+        values: [repeats] a metric, or a difference, of the drawn sets; those that are NaN because no image defines
+            the metric are left out.
         scenes: how many scenes define it; fewer than :data:`MIN_SCENES` give NaN.
     """
     values = values[~np.isnan(values)]

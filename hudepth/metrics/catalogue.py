@@ -1,17 +1,25 @@
-"""What is known of each metric: unit, direction, decimals, where it is shown, and whose formula it is.
+"""Facts about each metric: unit, direction, decimals, where it is shown, and the source of its formula.
 
-Tables, plots, cards, comparisons and progress lines read it here. To add a metric, write its function and register it.
+Tables, plots, cards, comparisons and progress lines read them here. To add a metric, write its function and register
+it; it is then part of validation and of hudepth-test::
+
+    register(MetricInfo("worst", "largest error", unit="m", shown="narrow"), worst)
+
+with ``worst(pred_m, target_m, valid)``, each [b, 1, h, w], which returns [b]: NaN for images where it is undefined.
+hudepth imports the packages in ``trust=[my_package]`` first, so a package of your own can register metrics on import.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 Level = Literal["headline", "narrow", "wide", "edge", "edges", "files"]
 LEVELS: tuple[tuple[Level, ...], ...] = (("headline", "narrow", "wide"), ("edge", "edges"))
 """Tables of rising width; each has the metrics of those before it."""
+Function = Callable[..., Any]
+"""(pred_m, target_m, valid) -> [b]"""
 
 
 @dataclass(frozen=True)
@@ -27,7 +35,10 @@ class MetricInfo:
     decimals: int = 3
     shown: Level = "files"
     """The narrowest table that has it: ``headline``, ``narrow`` or ``wide``; of depth edges ``edge`` (in tables of
-    many runs too) or ``edges``; ``files``: metrics.json alone."""
+    many runs too) or ``edges``; ``files``: only metrics.json and per_image.csv."""
+    pool: Literal["pixels", "squares", "images"] = "images"
+    """What ``averaging=pooled`` takes: the mean over all pixels, the root of the mean square, or, for metrics that are
+    undefined for some images, still the mean over images."""
 
     @property
     def label(self) -> str:
@@ -52,10 +63,19 @@ _HU = "Hu et al. 2019"
 _DBE = "Koch et al. 2018 (iBims-1)"
 
 _CATALOGUE: dict[str, MetricInfo] = {}
+_FUNCTIONS: dict[str, Function] = {}
 
 
-def register(info: MetricInfo) -> None:
-    """Add a metric, or replace what is known of it."""
+def register(info: MetricInfo, function: Function | None = None) -> None:
+    """Add a metric, or replace it.
+
+    Args:
+        info: facts about it.
+        function: computes it for each image of a batch; None for metrics that hudepth computes elsewhere.
+    """
+    if function is not None:
+        _FUNCTIONS[info.name] = function
+        info = replace(info, pool="images")
     _CATALOGUE[info.name] = info
 
 
@@ -63,19 +83,24 @@ def _edge_level(kind: str, threshold: str) -> Level:
     return "files" if kind != "f1" else "edges" if threshold == "1" else "edge"
 
 
+def registered_functions() -> Mapping[str, Function]:
+    """Return the functions of metrics that were registered with one, by name."""
+    return dict(_FUNCTIONS)
+
+
 for _info in (
-    MetricInfo("abs_rel", _PAPER, shown="headline"),
-    MetricInfo("sq_rel", _EIGEN, unit="m", shown="wide"),
-    MetricInfo("mse", _PAPER, unit="m^2"),
-    MetricInfo("rmse", _EIGEN, unit="m", shown="headline"),
-    MetricInfo("rmse_log", _EIGEN, shown="wide"),
-    MetricInfo("log10", _PAPER, shown="narrow"),
-    MetricInfo("silog", _EIGEN, shown="wide"),
-    MetricInfo("mae", "mean absolute error", unit="m", shown="wide"),
+    MetricInfo("abs_rel", _PAPER, shown="headline", pool="pixels"),
+    MetricInfo("sq_rel", _EIGEN, unit="m", shown="wide", pool="pixels"),
+    MetricInfo("mse", _PAPER, unit="m^2", pool="pixels"),
+    MetricInfo("rmse", _EIGEN, unit="m", shown="headline", pool="squares"),
+    MetricInfo("rmse_log", _EIGEN, shown="wide", pool="squares"),
+    MetricInfo("log10", _PAPER, shown="narrow", pool="pixels"),
+    MetricInfo("silog", _EIGEN, shown="wide", pool="pixels"),
+    MetricInfo("mae", "mean absolute error", unit="m", shown="wide", pool="pixels"),
     MetricInfo("ssim", "Wang et al. 2004", higher_is_better=True, shown="narrow"),
-    MetricInfo("delta1", _EIGEN, higher_is_better=True, shown="headline"),
-    MetricInfo("delta2", _EIGEN, higher_is_better=True, shown="narrow"),
-    MetricInfo("delta3", _EIGEN, higher_is_better=True, shown="narrow"),
+    MetricInfo("delta1", _EIGEN, higher_is_better=True, shown="headline", pool="pixels"),
+    MetricInfo("delta2", _EIGEN, higher_is_better=True, shown="narrow", pool="pixels"),
+    MetricInfo("delta3", _EIGEN, higher_is_better=True, shown="narrow", pool="pixels"),
     *(
         MetricInfo(f"edge_{kind}_{threshold}", _HU, higher_is_better=True, shown=_edge_level(kind, threshold))
         for kind in ("precision", "recall", "f1")
@@ -89,7 +114,7 @@ for _info in (
 
 
 def metric_info(name: str) -> MetricInfo:
-    """Return what is known of a metric; ``val/abs_rel`` means ``abs_rel``, an unknown name is an error that falls."""
+    """Return the facts about a metric, also as ``val/abs_rel``; an unknown one counts as an error: lower is better."""
     name = name.rpartition("/")[2]
     return _CATALOGUE.get(name) or MetricInfo(name, "unknown")
 
@@ -98,9 +123,14 @@ def metric_names(shown: Level, *, among: Iterable[str] | None = None) -> list[st
     """Return the metrics of a table, in its order.
 
     Args:
-        shown: how wide the table is.
+        shown: width of the table.
         among: only these; default: all.
     """
     levels = next((level[: level.index(shown) + 1] for level in LEVELS if shown in level), (shown,))
     names = [name for name, info in _CATALOGUE.items() if info.shown in levels]
     return names if among is None else [name for name in names if name in set(among)]
+
+
+def depth_names() -> tuple[str, ...]:
+    """Return the metrics that follow from sums over pixels, defined for every image with a valid pixel."""
+    return tuple(name for name, info in _CATALOGUE.items() if info.pool != "images")

@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from hudepth.base.masked import full_precision
+from hudepth.metrics.catalogue import depth_names
 
 MIN_DEPTH_M = 1e-3
 """Predictions below this [m] count as this in logarithms and ratios."""
@@ -41,9 +42,7 @@ SUM_NAMES = (
 DELTAS = (1.25, 1.25**2, 1.25**3)
 """Thresholds of delta1, delta2, delta3."""
 
-METRIC_NAMES = (
-    "abs_rel", "sq_rel", "mse", "rmse", "rmse_log", "log10", "silog", "mae", "delta1", "delta2", "delta3",
-)  # fmt: skip
+METRIC_NAMES = depth_names()
 """Keys of :func:`depth_metrics_from_sums`."""
 
 

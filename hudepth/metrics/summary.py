@@ -1,13 +1,13 @@
-"""From the metrics of each image to those of a set of images, without their pixels.
+"""Metrics of a set of images from those of each image.
 
-Over images: the mean of the images' metrics. Pooled, over all pixels at once, with n_i pixels of image i that count:
+Over images: the mean of the images' metrics. Pooled over all pixels, of which n_i of image i count:
 
     mean metrics (abs_rel, sq_rel, mse, log10, mae, delta_k)   sum n_i x_i / sum n_i
     rmse, rmse_log                                             sqrt(sum n_i x_i^2 / sum n_i)
     silog   factor * sqrt(rmse_log^2 - lambda * log_bias^2), both pooled; log_bias is the mean of ln p - ln t
 
-So a metric of any set follows from columns that add up over images (:func:`additive`), which is also what resampling
-needs. The metrics themselves are defined in :mod:`hudepth.metrics.depth`, with which pooling agrees.
+So a metric of any set follows from columns that add up over images (:func:`additive`), which resampling uses too. The
+metrics themselves are defined in :mod:`hudepth.metrics.depth`, with which pooling agrees.
 """
 
 from __future__ import annotations
@@ -17,40 +17,32 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NotRequired, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
+from hudepth.metrics.catalogue import depth_names, metric_info
 
 Floats = NDArray[np.float64]
 
 LOG_BIAS = "log_bias"
-"""Mean of ln p - ln t: no metric, but pooled silog follows from it."""
-DEPTH_NAMES = (
-    "abs_rel", "sq_rel", "mse", "rmse", "rmse_log", "log10", "silog", "mae", "delta1", "delta2", "delta3", LOG_BIAS,
-)  # fmt: skip
-"""Defined for every image that has a pixel; others, like ssim, may be undefined (NaN) for some images."""
-SQUARED = ("rmse", "rmse_log")
-"""Pooled as squares."""
-_HIGHER_IS_BETTER = ("delta", "ssim", "edge_f1", "edge_precision", "edge_recall", "si_boundary_f1")
+"""Mean of ln p - ln t: not a metric, but pooled silog follows from it."""
+DEPTH_NAMES = (*depth_names(), LOG_BIAS)
+"""Defined for every image with a valid pixel; others, like ssim, may be undefined (NaN) for some images."""
 KEYS = ("id", "scene", "category", "pixels")
 """First columns of per_image.csv."""
 
 
-def higher_is_better(name: str) -> bool:
-    """Tell whether a metric is a share or a similarity; all others are errors."""
-    return name.startswith(_HIGHER_IS_BETTER)
-
-
 @dataclass(frozen=True)
 class ImageTable:
-    """Metrics of each image of a set, a row an image."""
+    """Metrics of each image of a set, one row per image."""
 
     ids: list[str]
     """Unique."""
     scenes: list[str]
-    """Empty where the data set names none."""
+    """Empty if the data set has none."""
     categories: list[str]
     pixels: NDArray[np.int64]
     """[n] pixels that count."""
@@ -58,43 +50,50 @@ class ImageTable:
     """[n] by metric; NaN where undefined."""
 
 
-def summarise(
-    table: ImageTable, *, averaging: str, silog_lambda: float = 1.0, silog_factor: float = 100.0
-) -> dict[str, float]:
+class SummaryOptions(TypedDict):
+    """How the metrics of images become those of a set."""
+
+    averaging: str
+    """``image`` or ``pooled``. Metrics that are undefined for some images, like ssim, are always averaged over the
+    images where they are defined."""
+    silog_lambda: NotRequired[float]
+    """Of pooled silog, as in :func:`hudepth.metrics.depth.depth_metrics_from_sums`; default: 1."""
+    silog_factor: NotRequired[float]
+    """The same; default: 100."""
+
+
+def summarise(table: ImageTable, **options: Unpack[SummaryOptions]) -> dict[str, float]:
     """Return the metrics of all images of a table together.
 
     Args:
         table: of the images.
-        averaging: ``image`` or ``pooled``. Metrics that are undefined for some images, like ssim, are in either case
-            averaged over the images where they are defined.
-        silog_lambda: of pooled silog, as in :func:`hudepth.metrics.depth.depth_metrics_from_sums`.
-        silog_factor: the same.
+        **options: see :class:`SummaryOptions`.
 
     Returns:
         The metrics of the table, without ``log_bias``; pooled silog only if the table has ``log_bias``. Images without
         a pixel that counts are skipped. NaN where a prediction was NaN (skipping it would flatter), and where a metric
         is defined for no image.
     """
-    sums = {name: column.sum(axis=1, keepdims=True) for name, column in additive(table, averaging=averaging).items()}
-    metrics = metrics_from_sums(sums, averaging=averaging, silog_lambda=silog_lambda, silog_factor=silog_factor)
+    columns = additive(table, averaging=options["averaging"])
+    metrics = metrics_from_sums({name: x.sum(axis=1, keepdims=True) for name, x in columns.items()}, **options)
     return {name: value.item() for name, value in metrics.items()}
 
 
 def additive(table: ImageTable, *, averaging: str) -> dict[str, Floats]:
-    """Return what adds up over images: for each name [2, n], weighted values and their weights."""
+    """Return columns that add up over images: for each name [2, n], weighted values and their weights."""
     columns = {}
     for name, values in table.values.items():
         pooled = averaging == "pooled" and name in DEPTH_NAMES
         weights = (table.pixels if pooled else table.pixels > 0).astype(np.float64)
         if name not in DEPTH_NAMES:
             weights[np.isnan(values)] = 0
-        terms = weights * (values**2 if pooled and name in SQUARED else values)
+        terms = weights * (values**2 if pooled and metric_info(name).pool == "squares" else values)
         columns[name] = np.stack([np.where(weights > 0, terms, 0), weights])
     return columns
 
 
 def metrics_from_sums(
-    sums: Mapping[str, Floats], *, averaging: str, silog_lambda: float, silog_factor: float
+    sums: Mapping[str, Floats], *, averaging: str, silog_lambda: float = 1.0, silog_factor: float = 100.0
 ) -> dict[str, Floats]:
     """Turn sums of :func:`additive` columns, [2, *] by name, into metrics, [*] by name; NaN where a weight is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -104,7 +103,7 @@ def metrics_from_sums(
             if means.pop("silog", None) is not None and bias is not None and "rmse_log" in means:
                 variance = means["rmse_log"] - silog_lambda * bias**2
                 means["silog"] = silog_factor * np.sqrt(np.maximum(variance, 0))  # rounding can leave less than 0
-            means |= {name: np.sqrt(means[name]) for name in SQUARED if name in means}
+            means |= {name: np.sqrt(mean) for name, mean in means.items() if metric_info(name).pool == "squares"}
     return means
 
 
@@ -121,7 +120,7 @@ def per_image_csv(table: ImageTable) -> str:
 
 
 def read_per_image(path: Path) -> ImageTable:
-    """Read what :func:`per_image_csv` wrote.
+    """Read the output of :func:`per_image_csv`.
 
     Raises:
         DataError: if the file is missing or damaged; the message names file and line.
@@ -134,19 +133,19 @@ def read_per_image(path: Path) -> ImageTable:
             reader = csv.reader(file)
             names = next(reader, [])
             if tuple(names[: len(KEYS)]) != KEYS or len(set(names)) != len(names) or len(names) == len(KEYS):
-                raise DataError(f"'{path}', line 1: no header {', '.join(KEYS)} and then metrics. {again}")
+                raise DataError(f"'{path}', line 1: the header is not {', '.join(KEYS)} and then metrics. {again}")
             for cells in reader:
                 where = f"'{path}', line {reader.line_num}"
                 if len(cells) != len(names):
                     raise DataError(f"{where}: {len(cells)} values under {len(names)} names. {again}")
                 if cells[0] in rows:
                     raise DataError(f"{where}: a second row of image '{cells[0]}'. {again}")
-                numbers.append(_numbers(cells, names, where=where, mend=again))
+                numbers.append(_numbers(cells, names, where=where, fix=again))
                 rows[cells[0]] = cells[: len(KEYS)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"'{path}' cannot be read as a table of images ({error}). {again}") from error
     if not rows:
-        raise DataError(f"'{path}' holds no image. {again}")
+        raise DataError(f"'{path}' contains no image. {again}")
     ids, scenes, categories, pixels = (list(column) for column in zip(*rows.values(), strict=True))
     return ImageTable(
         ids=ids,
@@ -157,10 +156,10 @@ def read_per_image(path: Path) -> ImageTable:
     )
 
 
-def _numbers(cells: list[str], names: list[str], *, where: str, mend: str) -> list[float]:
-    """Return the metrics of a row, all at once: a report may read hundreds of thousands of rows."""
+def _numbers(cells: list[str], names: list[str], *, where: str, fix: str) -> list[float]:
+    """Convert a row at once: a report may read hundreds of thousands of rows."""
     if not cells[3].isascii() or not cells[3].isdigit() or len(cells[3]) > 18:  # what 64 bits hold
-        raise DataError(f"{where}: pixels '{cells[3]}' is no count. {mend}")
+        raise DataError(f"{where}: pixels '{cells[3]}' is not a count. {fix}")
     try:
         return [float(cell) for cell in cells[len(KEYS) :]]
     except ValueError as error:
@@ -169,5 +168,5 @@ def _numbers(cells: list[str], names: list[str], *, where: str, mend: str) -> li
         try:
             float(cell)
         except ValueError:
-            raise DataError(f"{where}: {name} '{cell}' is no number. {mend}") from None
+            raise DataError(f"{where}: {name} '{cell}' is not a number. {fix}") from None
     raise found

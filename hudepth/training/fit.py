@@ -14,7 +14,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.base.instantiate import has_target, instantiate
+from hudepth.base.instantiate import has_target, import_trusted, instantiate
 from hudepth.base.machine import keep_freed_memory
 from hudepth.base.options import parse
 from hudepth.data.build import build_data
@@ -40,6 +40,7 @@ def fit(training: Training) -> float | None:
     log.info("run directory: %s", path)
     seed_everything(options.seed, verbose=False)
     keep_freed_memory()
+    import_trusted(options.trust)
     data = build_datamodule(training)
     net = build_network(training, data)
     restore_split(training, data)

@@ -14,13 +14,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
-from torchmetrics import MetricCollection
 
 from hudepth.base.errors import ConfigError, TrainingError
 from hudepth.base.types import Batch
 from hudepth.losses.distillation import Distillation
-from hudepth.metrics.collection import DepthMetrics, DepthSSIM
-from hudepth.metrics.depth import METRIC_NAMES
+from hudepth.metrics.collection import validation_metrics, validation_names
 from hudepth.runs import checkpoint as ckpt
 from hudepth.training.averaging import averaged_state
 from hudepth.training.schedules import StepSchedule
@@ -78,9 +76,7 @@ class DepthModule(LightningModule):
         self.loss = loss
         self.distill = distill
         self.max_depth_m = max_depth_m
-        self.val_metrics = MetricCollection(
-            {"depth": DepthMetrics(), "ssim": DepthSSIM(data_range=max_depth_m)}, prefix="val/", compute_groups=False
-        )
+        self.val_metrics = validation_metrics(max_depth_m=max_depth_m, prefix="val/")
         self._make_optimizer, self._make_scheduler = optimizer, scheduler
         self._record = record or {}
         self._unchecked: deque[_Step] = deque()
@@ -110,7 +106,7 @@ class DepthModule(LightningModule):
         depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
         terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
         return [
-            *(f"val/{name}" for name in (*METRIC_NAMES, "ssim")),
+            *(f"val/{name}" for name in validation_names()),
             *(loss_name("val", term) for term in terms),
             *(loss_name("train", term) for term in (*terms, *(["distill"] if self.distill else []))),
         ]

@@ -18,6 +18,7 @@ from hudepth.base.types import Batch
 from hudepth.data.sources.base import Record
 from hudepth.evaluation.grids import SUM_COLUMNS
 from hudepth.evaluation.scoring import BatchScores, BatchTruth, image_table
+from hudepth.metrics import catalogue
 from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.summary import ImageTable, summarise
@@ -326,3 +327,22 @@ def test_an_image_of_which_the_crop_leaves_nothing_is_left_out() -> None:
     assert scores.sums(protocol)[0, 0] == 0
     assert scores.boundary(protocol).isnan().all()
     assert scores.strata(protocol).sum() == 0
+
+
+def test_a_registered_metric_becomes_a_column(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "_CATALOGUE", {**catalogue._CATALOGUE})
+    monkeypatch.setattr(catalogue, "_FUNCTIONS", {})
+    catalogue.register(
+        catalogue.MetricInfo("bias", "this test", unit="m", shown="narrow"),
+        lambda pred, target, valid: torch.where(valid, pred - target, 0.0).sum((1, 2, 3)) / valid.sum((1, 2, 3)),
+    )
+    truth = torch.full((2, 1, 32, 32), 0.2)
+    batch = Batch(image=torch.zeros(2, 3, 32, 32), unit_depth=truth, valid=truth > 0, index=torch.arange(2))
+    batch["valid"][1] = False
+    protocol = Protocol(name="x")
+    scores = BatchScores(truth * 10 + 0.5, BatchTruth(batch, max_depth_m=10.0))
+    records = [Record(id=str(i), scene="", frame=i) for i in range(2)]
+    values = image_table(protocol, scores.sums(protocol), records).values["bias"]
+    assert values[0] == pytest.approx(0.5)
+    assert np.isnan(values[1])
+    assert "bias" in catalogue.metric_names("narrow")

@@ -44,8 +44,8 @@ def test_crop_stays_inside_and_covers_its_share(height: int, width: int) -> None
     rows, columns = Protocol(**EIGEN).window(height, width) or (slice(0), slice(0))
     assert 0 <= rows.start < rows.stop <= height
     assert 0 <= columns.start < columns.stop <= width
-    assert (rows.stop - rows.start) / height == pytest.approx(426 / 480, abs=1 / height)
-    assert (columns.stop - columns.start) / width == pytest.approx(560 / 640, abs=1 / width)
+    assert (rows.stop - rows.start) / height == pytest.approx(426 / 480, abs=1.001 / height)
+    assert (columns.stop - columns.start) / width == pytest.approx(560 / 640, abs=1.001 / width)
 
 
 # --- the stamp --------------------------------------------------------------------------------------------------
@@ -136,84 +136,60 @@ def test_the_stamp_of_the_usual_benchmark() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "key"),
     [
-        (
-            {"resolution": "natve"},
-            "protocol.x.resolution: no 'natve'. Did you mean 'native'? Pass one of network, native.",
-        ),
-        (
-            {"averaging": "pool"},
-            "protocol.x.averaging: no 'pool'. Did you mean 'pooled'? Pass one of image, pooled.",
-        ),
-        ({"crop": [1, 2, 3]}, "protocol.x.crop: [1, 2, 3] is not [top,bottom,left,right] within [480, 640]."),
-        ({"crop": [9, 9, 0, 9]}, "protocol.x.crop: [9, 9, 0, 9] is not [top,bottom,left,right] within [480, 640]."),
-        ({"crop": [-9, 9, 0, 9]}, "protocol.x.crop: [-9, 9, 0, 9] is not [top,bottom,left,right] within [480, 640]."),
-        (
-            {"crop": [0, 300, 0, 320], "crop_size": [240, 320]},
-            "protocol.x.crop: [0, 300, 0, 320] is not [top,bottom,left,right] within [240, 320].",
-        ),
-        ({"crop": [9, 9, 0, 9], "crop_size": None}, "protocol.x.crop: [9, 9, 0, 9] is not [top,bottom,left,right]."),
-        (
-            {"resize": "cubic"},
-            "protocol.x.resize: no 'cubic'. Did you mean 'bicubic'? Pass one of bilinear, bicubic, nearest.",
-        ),
-        (
-            {"alignment": "medain"},
-            "protocol.x.alignment: no 'medain'. Did you mean 'median'? Pass one of none, median, "
-            "least_squares, affine_inverse.",
-        ),
-        ({"valid": "opn"}, "protocol.x.valid: no 'opn'. Did you mean 'open'? Pass one of open, closed, measured."),
-        ({"crop_size": [480]}, "protocol.x.crop_size: [480] is not [height,width]."),
-        ({"min_depth_m": -0.1}, "protocol.x.min_depth_m: -0.1 is negative."),
-        ({"min_depth_m": 3.0, "max_depth_m": 2.0}, "protocol.x.max_depth_m: 2.0 is not above min_depth_m."),
-        ({"silog_lambda": 1.5}, "protocol.x.silog_lambda: 1.5 is not in [0, 1]."),
-        ({"ssim_window": 0}, "protocol.x: ssim_data_range_m and ssim_window must be positive."),
-        ({"ssim_data_range_m": 0.0}, "protocol.x: ssim_data_range_m and ssim_window must be positive."),
-        ({"max_depth_m": math.inf}, "protocol.x.max_depth_m: 'inf' is no finite number."),
-        ({"silog_factor": math.nan}, "protocol.x.silog_factor: 'nan' is no finite number."),
-        (
-            {"extra": {"a": math.inf}},
-            "protocol.x.extra: '{'a': inf}' cannot be written as a JSON object.",
-        ),
+        ({"resolution": "natve"}, "resolution"),
+        ({"averaging": "pool"}, "averaging"),
+        ({"crop": [1, 2, 3]}, "crop"),
+        ({"crop": [9, 9, 0, 9]}, "crop"),
+        ({"crop": [-9, 9, 0, 9]}, "crop"),
+        ({"crop": [0, 300, 0, 320], "crop_size": [240, 320]}, "crop"),
+        ({"crop": [9, 9, 0, 9], "crop_size": None}, "crop"),
+        ({"resize": "cubic"}, "resize"),
+        ({"alignment": "medain"}, "alignment"),
+        ({"valid": "opn"}, "valid"),
+        ({"crop_size": [480]}, "crop_size"),
+        ({"min_depth_m": -0.1}, "min_depth_m"),
+        ({"min_depth_m": 3.0, "max_depth_m": 2.0}, "max_depth_m"),
+        ({"silog_lambda": 1.5}, "silog_lambda"),
+        ({"ssim_window": 0}, "ssim_window"),
+        ({"ssim_data_range_m": 0.0}, "ssim_data_range_m"),
+        ({"max_depth_m": math.inf}, "max_depth_m"),
+        ({"silog_factor": math.nan}, "silog_factor"),
+        ({"extra": {"a": math.inf}}, "extra"),
     ],
 )
-def test_options_out_of_range(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+def test_options_out_of_range(options: dict[str, Any], key: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^protocol\.x\.{key}: "):
         Protocol(name="x", **options)
-    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("field", "value"),
     [
-        ("crop", 5, "protocol.x.crop: 5 is not [top,bottom,left,right] within [480, 640]."),
-        ("crop", [0.5, 9, 0, 9], "protocol.x.crop: [0.5, 9, 0, 9] is not [top,bottom,left,right] within [480, 640]."),
-        ("crop", [0, 9, 0, "a"], "protocol.x.crop: [0, 9, 0, 'a'] is not [top,bottom,left,right] within [480, 640]."),
-        ("crop_size", [1.5, 9], "protocol.x.crop_size: [1.5, 9] is not [height,width]."),
-        ("resize", 5, "protocol.x.resize: no '5'. Pass one of bilinear, bicubic, nearest."),
-        ("min_depth_m", None, "protocol.x.min_depth_m: 'None' is no finite number."),
-        ("max_depth_m", "ten", "protocol.x.max_depth_m: 'ten' is no finite number."),
-        ("ssim_window", 2.5, "protocol.x.ssim_window: '2.5' is no whole number of pixels."),
-        ("flip", "maybe", "protocol.x.flip: 'maybe' is neither true nor false."),
-        ("extra", 5, "protocol.x.extra: '5' cannot be written as a JSON object."),
+        ("crop", 5),
+        ("crop", [0.5, 9, 0, 9]),
+        ("crop", [0, 9, 0, "a"]),
+        ("crop_size", [1.5, 9]),
+        ("resize", 5),
+        ("min_depth_m", None),
+        ("max_depth_m", "ten"),
+        ("ssim_window", 2.5),
+        ("flip", "maybe"),
+        ("extra", 5),
     ],
 )
-def test_options_of_another_kind(field: str, value: object, message: str) -> None:
+def test_options_of_another_kind(field: str, value: object) -> None:
     protocol = Protocol(name="x")
-    object.__setattr__(protocol, field, value)  # as a configuration brings it, past the types that tests check
-    with pytest.raises(ConfigError) as caught:
+    object.__setattr__(protocol, field, value)  # as from a configuration, bypassing the type checker of the tests
+    with pytest.raises(ConfigError, match=rf"^protocol\.x\.{field}: "):
         protocol.__post_init__()
-    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", "/tmp/a", "a\\b", "a\n"])
 def test_a_name_is_that_of_a_folder(name: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=r"^protocol: [\s\S]* folder"):
         Protocol(name=name)
-    assert str(caught.value) == (
-        f"protocol: '{name}' is no name for a folder. Pass a word, as protocol.eigen.name=mine."
-    )
 
 
 def test_a_crop_that_leaves_nothing_of_a_small_image() -> None:

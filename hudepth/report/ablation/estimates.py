@@ -17,9 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hudepth.metrics.bootstrap import LEVEL, Draws, interval_of
+from hudepth.metrics.bootstrap import LEVEL, Draws, interval_of, student_quantile
 from hudepth.metrics.catalogue import metric_info
-from hudepth.metrics.student import student_quantile
 
 BETTER, WORSE, NOT_SHOWN = "better", "worse", "not shown"
 
