@@ -24,7 +24,7 @@ from hudepth import cli
 ROOT = Path(__file__).parents[1]
 PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
 README = PAGES[ROOT / "README.md"]
-TEXT = "\n".join(PAGES.values())
+TEXT = "\n".join(text for path, text in PAGES.items() if path.stem != "extending")  # tests/test_extending.py
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.DOTALL)
 COMMANDS = list(
     dict.fromkeys(line for language, block in BLOCKS if language == "bash" for line in block.strip().splitlines())
