@@ -32,8 +32,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (command,) = blocks("bash")
     script, *words = shlex.split(command)
     environment = {**os.environ, "PYTHONPATH": str(folder), "HUDEPTH_CACHE": str(folder / "cache")}
+    words += ["trainer.accelerator=cpu", "logger=none", "callbacks.panels=0"]
     done = subprocess.run(
-        [str(Path(sys.executable).parent / script), *words, "trainer.accelerator=cpu", "logger=none", "callbacks.panels=0"],
+        [str(Path(sys.executable).parent / script), *words],
         cwd=folder, env=environment, text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
