@@ -1,10 +1,11 @@
 """hudepth: monocular depth estimation with a hybrid UNet and the BADCL loss.
 
-The package imports nothing heavy: ``import hudepth`` takes milliseconds, torch is loaded by what needs it.
+``import hudepth`` takes milliseconds; torch is loaded on first use.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def load(spec: Any, **options: Any) -> DepthModel:
         **options: ``backend``, ``device``, ``precision``, ``threads``, ``size``, ``fit``, ``trust``, ``runs``.
 
     Raises:
-        HudepthError: with one line that says what to do.
+        HudepthError: with one line that states the fix.
     """
     from hudepth.inference.model import load as load_model
 
@@ -31,12 +32,7 @@ def load(spec: Any, **options: Any) -> DepthModel:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "DepthMap":
-        from hudepth.inference.depth_map import DepthMap
-
-        return DepthMap
-    if name == "DepthModel":
-        from hudepth.inference.model import DepthModel
-
-        return DepthModel
+    modules = {"DepthMap": "hudepth.inference.depth_map", "DepthModel": "hudepth.inference.model"}
+    if name in modules:
+        return getattr(import_module(modules[name]), name)
     raise AttributeError(f"module 'hudepth' has no attribute '{name}'")

@@ -1,4 +1,4 @@
-"""What people see: log lines, progress on long work, tables."""
+"""Log lines and progress bars on standard error."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ console = Console(stderr=True)
 log = logging.getLogger("hudepth")
 
 _shown = {"level": logging.INFO}
-"""From which level on log lines reach the terminal."""
+"""The lowest level of log lines that reach the terminal."""
 
 
 class _CurrentStderr(logging.Handler):
-    """Writes to what is standard error when a line comes: a progress bar puts its own in place, to stay below lines."""
+    """Writes to the current ``sys.stderr``: a progress bar replaces it, to stay below log lines."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(self.format(record), file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""What runs a training or a test: a Trainer on devices that are there, in no more processes than there are pairs."""
+"""The Trainer of a training or a test, on devices that exist, in no more processes than there are pairs."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ GPUS = {
     "cuda": (CUDAAccelerator,),
     "mps": (MPSAccelerator,),
 }
-"""Accelerators that a machine may lack, and what each can be."""
+"""Accelerators that a machine may lack, and their implementations."""
 
 
 def check_devices(options: Mapping[str, Any]) -> None:
-    """Check that what ``trainer`` asks for is there, before anything is prepared or written.
+    """Check that the requested devices exist, before anything is prepared or written.
 
     Args:
         options: the ``trainer`` part of a configuration.
 
     Raises:
-        ConfigError: for a GPU where there is none, or batch norm over processes where PyTorch has none.
+        ConfigError: for a GPU where there is none, or synchronised batch norm without one.
     """
     accelerator = str(options.get("accelerator", "auto"))
     if accelerator in GPUS and not any(kind.is_available() for kind in GPUS[accelerator]):
         several = str(options.get("devices", 1)) != "1"
-        mend = "trainer.accelerator=cpu" + (" trainer.devices=2, or as many as there are cores" if several else "")
-        raise ConfigError(f"trainer.accelerator={accelerator}: no GPU here. Pass {mend}.")
+        fix = "trainer.accelerator=cpu" + (" trainer.devices=2, or as many as there are cores" if several else "")
+        raise ConfigError(f"trainer.accelerator={accelerator}: no GPU here. Pass {fix}.")
     on_cpu = accelerator == "cpu" or (accelerator == "auto" and not any(kind.is_available() for kind in GPUS["gpu"]))
     if options.get("sync_batchnorm") and on_cpu:
         raise ConfigError(
-            "trainer.sync_batchnorm: PyTorch has it on GPUs only. Pass trainer.sync_batchnorm=false, and each process "
+            "trainer.sync_batchnorm: PyTorch supports it on GPUs only. Pass trainer.sync_batchnorm=false, and each process "
             "normalises by its own share of a batch."
         )
 
@@ -50,10 +50,10 @@ def build_trainer(options: Mapping[str, Any], **fixed: Any) -> Trainer:
 
     Args:
         options: the ``trainer`` part of a configuration.
-        **fixed: what is not configured.
+        **fixed: arguments that are not configurable.
 
     Raises:
-        ConfigError: if the devices are not there, or Lightning refuses an option.
+        ConfigError: if a device is missing, or Lightning refuses an option.
     """
     check_devices(options)
     try:
@@ -63,10 +63,10 @@ def build_trainer(options: Mapping[str, Any], **fixed: Any) -> Trainer:
 
 
 def check_shares(trainer: Trainer, *, subset: str, pairs: int) -> None:
-    """Check that every process has something to score: one without would leave the others waiting.
+    """Check that every process has a pair to score: the others would wait for one without.
 
     Args:
-        trainer: knows the number of processes.
+        trainer: with the number of processes.
         subset: ``validation`` or ``test``.
         pairs: in the subset.
 
@@ -82,7 +82,7 @@ def check_shares(trainer: Trainer, *, subset: str, pairs: int) -> None:
 
 @contextmanager
 def without_known_warnings() -> Iterator[None]:
-    """Hide warnings of the libraries that no user can act upon."""
+    """Hide warnings of libraries that no user can act on."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*does not have many workers.*")  # reading a store needs none
         warnings.filterwarnings("ignore", ".*exists and is not empty.*")  # the run directory, by design
@@ -94,5 +94,5 @@ def without_known_warnings() -> Iterator[None]:
 
 
 def is_first_process() -> bool:
-    """Tell whether this process writes to the run directory: of a distributed run only the first does."""
+    """Return whether this process writes to the run directory: only the first of a distributed run does."""
     return bool(getattr(rank_zero_only, "rank", 0) == 0)

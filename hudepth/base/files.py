@@ -14,18 +14,18 @@ import yaml
 
 @contextmanager
 def written_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Give a path beside ``path`` to write to; rename it to ``path`` only if the block ends well.
+    """Yield a temporary path next to ``path`` to write to; rename it to ``path`` only if the block succeeds.
 
-    Whatever happens in between (an exception, a full disk, a kill), an earlier ``path`` stays as it was. After a
+    Whatever happens in between (an exception, a full disk, a kill), an existing ``path`` stays as it was. After a
     kill the unfinished file remains under a name that starts with a dot and ends in ``.part``.
 
     Args:
         path: the file to appear; its folder is made.
-        durable: wait until the disk has it, so that a power cut is no danger either; for thousands of files that can
-            be made again the wait is not worth it.
+        durable: flush to disk first, so that the file also survives a power cut; not worth the wait for thousands of
+            files that can be made again.
 
     Raises:
-        OSError: whatever the file system says.
+        OSError: from the file system.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -62,7 +62,7 @@ def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as indented JSON, whole or not at all.
 
     Raises:
-        ValueError: if it holds NaN or infinity, which JSON has no word for.
+        ValueError: if it holds NaN or infinity, which JSON cannot express.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
@@ -71,9 +71,9 @@ def read_yaml(path: Path) -> Any:
     """Read plain YAML, with the fast parser where PyYAML was built with it.
 
     Raises:
-        OSError: whatever the file system says.
-        UnicodeDecodeError: if it is no text.
-        yaml.YAMLError: if it is no YAML.
+        OSError: from the file system.
+        UnicodeDecodeError: if it is not text.
+        yaml.YAMLError: if it is not YAML.
     """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     return yaml.load(path.read_text(encoding="utf-8"), Loader=loader)

@@ -1,7 +1,7 @@
-"""Processes that torchrun or SLURM started: they agree on one run directory before anything else happens.
+"""Processes started by torchrun or SLURM agree on one run directory before anything else happens.
 
-Processes that Lightning starts by itself inherit it from the first one. These do not know of each other, so they join
-here, through the same rendezvous that Lightning would use later, and Lightning finds them joined.
+Processes that Lightning starts inherit it from the first one. These do not know of each other, so they join here,
+through the rendezvous that Lightning would use later.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ JOIN_TIMEOUT = timedelta(minutes=30)
 
 
 def environment() -> TorchElasticEnvironment | SLURMEnvironment | None:
-    """Return how this process was launched together with others; None if it was not."""
+    """Return the launcher of this process; None if it runs alone."""
     for kind in (TorchElasticEnvironment, SLURMEnvironment):
         if kind.detect():
             found: TorchElasticEnvironment | SLURMEnvironment = kind()
@@ -33,17 +33,17 @@ def environment() -> TorchElasticEnvironment | SLURMEnvironment | None:
 
 
 def shared_path(make: Callable[[], Path], options: Mapping[str, Any]) -> Path:
-    """Return the run directory of processes that were launched together; the first one makes it.
+    """Return the run directory of all processes of a launch; the first one makes it.
 
     Args:
         make: makes the directory.
         options: the ``trainer`` part of the configuration.
 
     Returns:
-        What ``make`` returned in the first process; in one that is alone, what it returns here.
+        What ``make`` returned in the first process.
 
     Raises:
-        ConfigError: if ``trainer`` asks for another number of processes than were launched.
+        ConfigError: if ``trainer`` requests another number of processes than were launched.
     """
     launched = environment()
     if launched is None:
@@ -65,7 +65,7 @@ def shared_path(make: Callable[[], Path], options: Mapping[str, Any]) -> Path:
     if launched.global_rank() == 0:
         try:
             box = [str(make())]
-        except ConfigError as error:  # the others must hear of it, or they would wait for ever
+        except ConfigError as error:  # the others must fail, too, instead of waiting for ever
             box = [error]
     distributed.broadcast_object_list(box, src=0, device=torch.device("cpu"))
     if isinstance(box[0], ConfigError):

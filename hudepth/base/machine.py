@@ -1,4 +1,4 @@
-"""What this machine offers a process."""
+"""The machine: usable cores, devices, and the hardware that timings depend on."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ if TYPE_CHECKING:
     import torch
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
-"""Where Linux says how much processor time a container gets: quota and period, or ``max``."""
+"""Linux's limit of a container's processor time: quota and period, or ``max``."""
 CPUINFO = Path("/proc/cpuinfo")
 INSTRUCTION_SETS = (
     "avx2", "fma", "avx512f", "avx512_vnni", "avx_vnni", "avx512_bf16", "avx512_fp16", "amx_tile", "amx_bf16",
     "amx_int8", "asimd", "asimddp", "sve", "bf16", "i8mm",
 )  # fmt: skip
-"""Of a processor's many, those that decide how fast networks run on it."""
+"""Those that decide how fast networks run on a processor."""
 PACKAGES = ("torch", "onnxruntime", "openvino", "nncf", "transformers")
-"""What networks are run with, or made smaller by."""
-
+"""The runtimes and compressors of networks."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Options of mallopt, from malloc.h of the GNU C library."""
 
 
 def usable_cores() -> int:
-    """Return how many cores this process may keep busy: those it may run on, at most what its container is allowed."""
+    """Return how many cores this process may use: those it may run on, at most what its container is allowed."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = CGROUP_LIMIT.read_text(encoding="ascii").split()
@@ -43,7 +42,7 @@ def usable_cores() -> int:
 
 
 def torch_device(name: str, *, among: Sequence[str] = ("cuda", "mps", "cpu")) -> torch.device:
-    """Return the device of a name; ``auto`` means the first of ``among`` that this machine has.
+    """Return a device by name; ``auto`` is the first of ``among`` that this machine has.
 
     Raises:
         ConfigError: if this machine has no such device.
@@ -58,7 +57,7 @@ def torch_device(name: str, *, among: Sequence[str] = ("cuda", "mps", "cpu")) ->
 
 
 def hardware() -> dict[str, Any]:
-    """Return what a reader of times needs to know of the machine and of what computes on it.
+    """Describe the machine and its runtimes, for readers of timings.
 
     Returns:
         ``processor``, ``cores``, ``usable_cores``, ``memory_gb`` (None where it is not known), ``instruction_sets``
@@ -95,14 +94,14 @@ def _version(package: str) -> str | None:
 
 
 def keep_freed_memory() -> bool:
-    """Let the C library keep memory that is freed, instead of giving it back to the system and asking again.
+    """Let the C library keep freed memory instead of returning it to the system.
 
-    A training step allocates the same large tensors over and over. By default each gets new pages, which the system has
-    to clear one by one: a sixth of the time of a step at 224 x 224 in float32, a twelfth in bfloat16
-    (``experiments/speed``). The process keeps what it once needed until it ends.
+    A training step allocates the same large tensors over and over. By default each gets new pages, which the system
+    clears one by one: a sixth of the time of a step at 224 x 224 in float32, a twelfth in bfloat16
+    (``experiments/speed``). The process keeps its peak memory until it ends.
 
     Returns:
-        Whether it is done: with the GNU C library only.
+        Whether it worked: the GNU C library only.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

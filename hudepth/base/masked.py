@@ -1,4 +1,4 @@
-"""Sums and means over valid pixels, in full precision: what every loss and metric reduces with."""
+"""Sums and means over valid pixels, in full precision: the reductions of every loss and metric."""
 
 from __future__ import annotations
 
