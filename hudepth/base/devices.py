@@ -40,8 +40,8 @@ def check_devices(options: Mapping[str, Any]) -> None:
     on_cpu = accelerator == "cpu" or (accelerator == "auto" and not any(kind.is_available() for kind in GPUS["gpu"]))
     if options.get("sync_batchnorm") and on_cpu:
         raise ConfigError(
-            "trainer.sync_batchnorm: PyTorch supports it on GPUs only. Pass trainer.sync_batchnorm=false, and each process "
-            "normalises by its own share of a batch."
+            "trainer.sync_batchnorm: PyTorch supports it on GPUs only. Pass trainer.sync_batchnorm=false; then each "
+            "process normalises by its own share of a batch."
         )
 
 
