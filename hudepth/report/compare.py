@@ -64,7 +64,9 @@ def compare(options: CompareOptions) -> None:
     output = output_folder(options.output or "compare")
     write_json(output / "compare.json", _document(a, b, differences, uncertainty))
     write_text(output / "compare.csv", _per_image(*tables).to_csv())
-    save_figure(output / "compare.png", _draw(a, b, tables))
+    ids, values = tables[0].ids, [table.values[PER_IMAGE[0]] for table in tables]
+    title, most = f"a: {_name(a)}\nb: {_name(b)}", differing(a, b, SHOWN)
+    save_figure(output / "compare.png", draw_comparison(ids, *values, shown=most, metric=PER_IMAGE[0], title=title))
     print_comparison(a, b, differences, uncertainty)
     _draw_images(output / "images.png", a, b, options)
     log.info("table and pictures: %s", output.resolve())
@@ -155,13 +157,6 @@ def _per_image(a: ImageTable, b: ImageTable) -> Table:
         keys = (a.ids[row], a.scenes[row], a.categories[row], str(a.pixels[row]))
         table.add(*keys, *(f"{column[row]:.9g}" for column in values))
     return table
-
-
-def _draw(a: Result, b: Result, tables: tuple[ImageTable, ImageTable]) -> Any:
-    metric, ids = PER_IMAGE[0], tables[0].ids
-    shown = [ids[row] for row in _by_difference(*tables, metric=metric)[:SHOWN]]
-    title = f"a: {_name(a)}\nb: {_name(b)}"
-    return draw_comparison(ids, *(table.values[metric] for table in tables), shown=shown, metric=metric, title=title)
 
 
 def _name(result: Result) -> str:

@@ -48,6 +48,11 @@ def run_key(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
+def canonical(value: Any) -> str:
+    """Return a text that is equal for equal values: 1 and 1.0 are equal, 1 and true are not."""
+    return json.dumps(_normalise(value), sort_keys=True, default=str)
+
+
 def _normalise(value: Any) -> Any:
     """Make 1 and 1.0 the same number, also within lists."""
     if isinstance(value, list | tuple):

@@ -14,30 +14,25 @@ NAMED = 3
 """Most runs that a line lists by name."""
 
 
-def undefined(table: Sequence[Row], metrics: Sequence[str]) -> list[str]:
+def undefined(rows: Sequence[Row], metrics: Sequence[str]) -> list[str]:
     """List rows without a mean, since a metric is undefined for one of their seeds."""
     lines = []
-    for row in table:
+    for row in rows:
         gaps: dict[str, list[str]] = {}
-        for name in metrics:
-            values = row.estimates[name].values if row.runs else {}
-            lacking = [seed for seed, value in values.items() if not math.isfinite(value)]
-            if lacking:
-                gaps.setdefault(", ".join(lacking), []).append(name)
-        lines += [
-            f"'{row.label}' has no {', '.join(names)}: undefined for seed {seeds}" for seeds, names in gaps.items()
-        ]
+        for name in metrics if row.runs else ():
+            if seeds := [seed for seed, value in row.estimates[name].values.items() if not math.isfinite(value)]:
+                gaps.setdefault(", ".join(seeds), []).append(name)
+        lines += [f"'{row.label}' has no {', '.join(gap)}: undefined for seed {seeds}" for seeds, gap in gaps.items()]
     return lines
 
 
-def unpaired(table: Sequence[Row], reference: Row) -> list[str]:
+def unpaired(rows: Sequence[Row], reference: Row) -> list[str]:
     """List rows whose seeds are not those of the reference."""
     lines = []
-    for row in table:
-        if row is reference or not row.runs or row.differs or reference.differs:
-            continue
+    for row in rows:
         shared = [seed for seed in reference.runs if seed in row.runs]
-        if len(shared) < max(len(row.runs), len(reference.runs)):
+        comparable = row.runs and not row.differs and not reference.differs
+        if comparable and len(shared) < max(len(row.runs), len(reference.runs)):
             only = f"are paired by seed {', '.join(shared)} alone" if shared else "have no seed in common to pair"
             lines.append(f"'{row.label}' and the reference {only}")
     return lines

@@ -15,8 +15,8 @@ from torch import nn
 from hudepth.base.instantiate import instantiate
 from hudepth.models.cost import counted_flops, parameters
 from hudepth.report.ablation.estimates import Estimate
-from hudepth.report.ablation.factors import canonical
 from hudepth.report.ablation.report import Report
+from hudepth.runs.identity import canonical
 from hudepth.viz.limits import usual_range
 from hudepth.viz.style import COLOURS, shorten, strip_frame
 

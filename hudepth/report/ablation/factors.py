@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hudepth.runs.identity import SEEDS, identity
+from hudepth.runs.identity import SEEDS, canonical, identity
 from hudepth.viz.style import shorten
 
 TARGET = "_target_"
@@ -49,19 +49,6 @@ def seed_of(config: Mapping[str, Any]) -> str:
     return "/".join(dict.fromkeys(str(seed) for seed in seeds if seed is not None)) or ABSENT
 
 
-def canonical(value: Any) -> str:
-    """Return a text that is equal for equal values; 1 and 1.0 are equal, 1 and true are not."""
-    if isinstance(value, bool) or value is None or isinstance(value, str):
-        return json.dumps(value)
-    if isinstance(value, int | float):
-        return repr(float(value))
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(canonical, value))}]"
-    if isinstance(value, Mapping):
-        return f"{{{','.join(f'{key}:{canonical(value[key])}' for key in sorted(value, key=str))}}}"
-    return str(value)
-
-
 def find_factors(variants: Sequence[Mapping[str, Any]]) -> list[Factor]:
     """Return what differs between rows.
 
@@ -85,12 +72,11 @@ def find_factors(variants: Sequence[Mapping[str, Any]]) -> list[Factor]:
     ]
 
 
-def config_differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def config_differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return every key in which two variants differ, with both values in full."""
-    keys = dict.fromkeys([*a, *b])
     return [
-        (key, _full(a[key]) if key in a else ABSENT, _full(b[key]) if key in b else ABSENT)
-        for key in keys
+        (key, *(_full(each[key]) if key in each else ABSENT for each in (a, b)))
+        for key in dict.fromkeys([*a, *b])
         if (key in a) != (key in b) or canonical(a.get(key)) != canonical(b.get(key))
     ]
 

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hudepth.metrics.catalogue import metric_info
-from hudepth.report.ablation.factors import canonical, format_value
+from hudepth.report.ablation.factors import format_value
 from hudepth.report.ablation.rows import Row
+from hudepth.runs.identity import canonical
 from hudepth.viz.limits import usual_range
 from hudepth.viz.style import ORANGE, strip_frame
 
@@ -28,13 +29,13 @@ class Grid:
     """Rows that differ in nothing but the weights."""
 
     y: str
-    """Names of the weights: down, across, and from panel to panel; the last is empty if it does not vary."""
     x: str
     panel: str
+    """Names of the weights: down, across, and from panel to panel; the last is empty if it does not vary."""
     ys: list[str]
-    """Their formatted values, lowest first."""
     xs: list[str]
     panels: list[str]
+    """Their formatted values, lowest first."""
     cells: dict[tuple[str, str, str], Row]
     """By value of panel, y and x."""
 
@@ -59,10 +60,10 @@ def find_grid(rows: Sequence[Row]) -> Grid | None:
     panel = more[0] if more else ""
     cells = {}
     for row in group:
-        places = [format_value(row.config[key]) if key else "" for key in (panel, y, x)]
-        cells[places[0], places[1], places[2]] = row
-    down, across, between = (key.rpartition(".")[2] for key in (y, x, panel))
-    return Grid(down, across, between, values[y], values[x], values[panel] if panel else [""], cells)
+        where, down, across = (format_value(row.config[key]) if key else "" for key in (panel, y, x))
+        cells[where, down, across] = row
+    names = [key.rpartition(".")[2] for key in (y, x, panel)]
+    return Grid(names[0], names[1], names[2], values[y], values[x], values[panel] if panel else [""], cells)
 
 
 def _sort_values(found: Sequence[Any]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from string import Template
@@ -113,38 +113,40 @@ def _facts(report: Report, more: Mapping[str, str]) -> Html:
 
 
 def _results(report: Report) -> Html:
-    digits = words.places(report)
     factors = report.factors if any(row.named for row in report.rows) else []  # else they are the row's name
     numbers = [_are_numbers(factor.shown) for factor in factors]
-    heads = [
-        _sorter("row", is_number=False),
-        *(_sorter(factor.name, is_number=each) for factor, each in zip(factors, numbers, strict=True)),
-        _sorter("seeds"),
-        *(_sorter(words.heading(name)) for name in report.metrics),
-    ]
-    rows = []
-    for row in report.rows:
+    heads = [_sorter(factor.name, is_number=each) for factor, each in zip(factors, numbers, strict=True)]
+
+    def lead(row: Row) -> list[Html]:
         cells = [_factor(value, is_number=each) for value, each in zip(row.factors, numbers, strict=False)]
-        cells.append(tag("td", row.counted, data_value=str(len(row.runs))))
-        rows.append(_row(row, [*cells, *(_result(row, name, digits[name]) for name in report.metrics)]))
-    return _table("Results", heads, rows, class_="sortable")
+        return [*cells, tag("td", row.counted, data_value=str(len(row.runs)))]
+
+    return _metrics("Results", report, report.rows, _result, [*heads, _sorter("seeds")], lead)
 
 
 def _differences(report: Report) -> Html:
-    digits = words.places(report)
-    heads = [_sorter("row", is_number=False), *(_sorter(words.heading(name)) for name in report.metrics)]
-    rows = [
-        _row(row, [_difference(row, name, digits[name]) for name in report.metrics])
-        for row in report.rows
-        if row.contrasts
-    ]
     note = (
         "Row minus reference, paired by seed and by image; below it the 95 % intervals over seeds and over scenes. "
         "Better or worse: both exclude 0. Among many rows some differ by chance."
     )
-    return _join(
-        [_table("Differences", heads, rows, class_="sortable"), tag("p", note, class_="quiet")] if rows else []
-    )
+    rows = [row for row in report.rows if row.contrasts]
+    table = _metrics("Differences", report, rows, _difference)
+    return _join([table, tag("p", note, class_="quiet")] if rows else [])
+
+
+def _metrics(
+    name: str,
+    report: Report,
+    rows: Iterable[Row],
+    cell: Callable[[Row, str, int], Html],
+    heads: Sequence[Html] = (),
+    lead: Callable[[Row], Sequence[Html]] = lambda _row: (),
+) -> Html:
+    """Return a sortable table of rows: what leads them, then a cell for each metric."""
+    digits = words.places(report)
+    heads = [_sorter("row", is_number=False), *heads, *(_sorter(words.heading(name)) for name in report.metrics)]
+    body = [_row(row, [*lead(row), *(cell(row, name, digits[name]) for name in report.metrics)]) for row in rows]
+    return _table(name, heads, body, class_="sortable")
 
 
 def _are_numbers(shown: Sequence[str]) -> bool:
@@ -208,39 +210,28 @@ def _figure(picture: Picture) -> Html:
     return tag("figure", tag("div", image, class_="wide"), caption)
 
 
-def _heads(*names: str) -> list[Html]:
-    return [tag("th", name, scope="col", class_="text flat") for name in names]
-
-
 def _troubles(report: Report) -> Html:
-    rows = [
-        tag(
-            "tr",
-            tag("th", each.run or "-", scope="row"),
-            *(tag("td", text, class_="text") for text in (each.row, each.seed, each.state)),
-            _long(each.why or "-"),
-        )
-        for each in report.troubles
-    ]
-    return _table("Runs that are in no mean", _heads("run", "row", "seed", "state", "why"), rows) if rows else Html()
+    rows = [(each.run or "-", each.row, each.seed, each.state, each.why or "-") for each in report.troubles]
+    return _listing("Runs that are in no mean", ("run", "row", "seed", "state", "why"), rows, long=(4,))
 
 
 def _configurations(report: Report) -> Html:
     parts = []
     for row in report.rows:
-        if row is report.reference:
-            continue
-        changes = config_differences(report.reference.config, row.config)
-        lines = [
-            tag("tr", tag("th", tag("code", key), scope="row"), *(_long(tag("code", value)) for value in values))
-            for key, *values in changes
-        ]
-        count = f"{len(changes)} key{'s' * (len(changes) != 1)} differ{'s' * (len(changes) == 1)}"
-        table = _table(f"Configuration of {row.label}", _heads("key", "reference", "this row"), lines)
-        parts.append(tag("details", tag("summary", f"{row.label}: {count}"), table))
+        if row is not report.reference:
+            changes = config_differences(report.reference.config, row.config)
+            count = f"{len(changes)} key{'s' * (len(changes) != 1)} differ{'s' * (len(changes) == 1)}"
+            lines = [[tag("code", text) for text in change] for change in changes]
+            table = _listing(f"Configuration of {row.label}", ("key", "reference", "this row"), lines, long=(1, 2))
+            parts.append(tag("details", tag("summary", f"{row.label}: {count}"), table))
     lead = f"How each row differs from {report.reference.label}, apart from seeds, names and paths."
-    return _join([tag("p", lead, class_="quiet"), *parts]) if parts else Html()
+    return _join([tag("p", lead, class_="quiet"), *parts] if parts else [])
 
 
-def _long(value: str) -> Html:
-    return tag("td", value, class_="text long")
+def _listing(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]], *, long: Sequence[int]) -> Html:
+    """Return a table of texts, nothing if it has no rows; ``long`` columns wrap."""
+    body = []
+    for first, *others in rows:
+        cells = (tag("td", x, class_="text long" if i in long else "text") for i, x in enumerate(others, start=1))
+        body.append(tag("tr", tag("th", first, scope="row"), *cells))
+    return _table(name, [tag("th", head, scope="col", class_="text flat") for head in heads], body) if body else Html()

@@ -41,15 +41,9 @@ Drawn = tuple[Figure, str, str] | None
 
 
 def draw_pictures(report: Report, folder: Path, *, config: Mapping[str, Any]) -> list[Picture]:
-    """Draw what there is to show; a picture of an earlier report that is not drawn this time is removed.
+    """Draw what there is to show into ``folder``; a picture of an earlier report that is not drawn again is removed.
 
-    Args:
-        report: of the sweep.
-        folder: to write to.
-        config: ``panels`` (how many images, 0: none), and ``paths``, ``data`` and ``trust`` to open runs with.
-
-    Raises:
-        OSError: if a file cannot be written.
+    ``config`` holds ``panels`` (how many images, 0: none), and ``paths``, ``data`` and ``trust`` to open runs with.
     """
     pictures = []
     for name, draw in DRAWN.items():
@@ -86,8 +80,8 @@ def _curves(report: Report, _config: Mapping[str, Any]) -> Drawn:
     if not any(key.startswith("val/") for runs in histories.values() for run in runs for row in run for key in row):
         return None
     order = sort_by_accuracy(report)
-    labels = [row.label for row in (order if len(order) > NAMED else report.rows)]
-    shown = list(dict.fromkeys([report.reference.label, *labels]))[: COLOURED if len(order) > NAMED else NAMED]
+    rows, count = (order, COLOURED) if len(order) > NAMED else (report.rows, NAMED)
+    shown = list(dict.fromkeys([report.reference.label, *(row.label for row in rows)]))[:count]
     monitor = str(next(iter(report.reference.runs.values())).run.config.get("monitor") or "")
     figure = draw_variants(histories, shown=shown, monitor=monitor)
     return figure, "Validation by epoch", "Lines: mean over seeds. Bands: from the lowest to the highest seed."
@@ -144,7 +138,6 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
         except HudepthError as error:
             log.warning("not in panels.png: '%s': %s", label, error)
     if not found:
-        log.info("no panels.png: no run could be opened")
         return None
     few = f" The reference and the {NETWORKS - 1} best of {len(report.rows)} rows." if len(runs) < len(order) else ""
     caption = f"Test images, their ground truth, and the lowest finished seed of each row, on one scale.{few}"
@@ -153,10 +146,10 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
 
 def sort_by_accuracy(report: Report) -> list[Row]:
     """Return the rows with a result: the reference, then the best first."""
+    means = {row.label: row.estimates[BY].mean if BY in row.estimates else math.nan for row in report.rows}
 
     def place(row: Row) -> tuple[bool, float]:
-        mean = row.estimates[BY].mean if BY in row.estimates else math.nan
-        return row is not report.reference, mean if math.isfinite(mean) else math.inf
+        return row is not report.reference, means[row.label] if math.isfinite(means[row.label]) else math.inf
 
     return sorted((row for row in report.rows if row.runs), key=place)
 

@@ -87,13 +87,7 @@ class Rows:
 
 
 def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[Run]], Iterable[Run]] = iter) -> Rows:
-    """Read the results of a sweep's runs and sort them into rows, in the order of the sweep.
-
-    Args:
-        sweep: its runs.
-        protocol: of the results to read.
-        track: wraps the list of runs, for a progress bar.
-    """
+    """Read the results of a protocol and sort runs into rows, in the order of the sweep; ``track`` shows progress."""
     groups: dict[str, list[tuple[Run, Result | str]]] = {}
     for run in track(sweep.runs):
         groups.setdefault(variant_key(run.config), []).append((run, _result(run, protocol)))
@@ -106,12 +100,7 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[Run]], Itera
 
 
 def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -> Row:
-    """Return the row that the others are compared with.
-
-    Args:
-        table: all rows.
-        name: a row's label, or its ``variant``; default: the first row that has a result.
-        protocol: of the results, for the message.
+    """Return the row that the others are compared with: ``name`` is a label or a ``variant``, None the first result.
 
     Raises:
         ConfigError: if there is no such row.
@@ -127,7 +116,7 @@ def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -
     found = found or [row for row in table if name in (row.named, *row.named.split(" / "))]
     if not found:
         labels = [row.label for row in table]
-        known = ", ".join(f"'{label}'" for label in labels[:8]) + (f" and {len(labels) - 8} more" * (len(labels) > 8))
+        known = ", ".join(f"'{label}'" for label in labels[:8]) + f" and {len(labels) - 8} more" * (len(labels) > 8)
         raise ConfigError(f"reference: no row '{name}'.{did_you_mean(name, labels)} There are {known}.")
     if len(found) > 1:
         fix = f"Pass one, as in reference='\"{found[0].label}\"'."

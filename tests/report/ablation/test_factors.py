@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.report.ablation.factors import (
-    canonical,
     config_differences,
     find_factors,
     format_value,
@@ -15,6 +14,7 @@ from hudepth.report.ablation.factors import (
     variant,
     variant_key,
 )
+from hudepth.runs.identity import canonical
 
 BADCL = {"_target_": "hudepth.losses.badcl.BADCL", "boundary": 3.0, "scaling": 1, "eps": 1e-8}
 SILOG = {"_target_": "hudepth.losses.baselines.SILog", "factor": 10.0}
