@@ -131,15 +131,13 @@ def _by_difference(a: ImageTable, b: ImageTable, *, metric: str) -> list[int]:
 def _document(a: Result, b: Result, differences: dict[str, Difference], uncertainty: dict[str, Any]) -> dict[str, Any]:
     metrics = {}
     for name, found in differences.items():
-        numbers = {"a": a.metrics[name], "b": b.metrics[name]}
-        numbers |= {"difference": found.value, "low": found.low, "high": found.high}
-        finite = {key: value if math.isfinite(value) else None for key, value in numbers.items()}
-        metrics[name] = {**finite, "verdict": verdict(name, found)}
+        values = (a.metrics[name], b.metrics[name], found.value, found.low, found.high)
+        finite = (value if math.isfinite(value) else None for value in values)
+        numbers = dict(zip(("a", "b", "difference", "low", "high"), finite, strict=True))
+        metrics[name] = {**numbers, "verdict": verdict(name, found)}
     return {
-        **{
-            side: {"path": str(each.path), "split": each.split, "checkpoint": each.document.get("checkpoint")}
-            for side, each in (("a", a), ("b", b))
-        },
+        "a": {"path": str(a.path), "split": a.split, "checkpoint": a.document.get("checkpoint")},
+        "b": {"path": str(b.path), "split": b.split, "checkpoint": b.document.get("checkpoint")},
         "images": len(a.table.ids),
         "protocol": a.stamp,
         "data": a.data,

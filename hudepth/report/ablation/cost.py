@@ -33,17 +33,12 @@ class Cost:
 
 
 def find_costs(report: Report, *, metric: str, trust: Sequence[str] = ()) -> list[Cost]:
-    """Return what the network of each row with a result costs; empty if all cost the same.
+    """Return what the network of each row with a result costs, with its estimate of a metric; empty if all are equal.
 
     Networks are built on the meta device, so that no weight is allocated or read.
 
-    Args:
-        report: of the sweep.
-        metric: whose estimate to state with the cost.
-        trust: further modules whose classes a configuration may name.
-
     Raises:
-        HudepthError: if a configuration cannot be built.
+        HudepthError: if a configuration cannot be built, as of a class from a module that ``trust`` does not list.
     """
     known: dict[str, tuple[int, int]] = {}
     found = []

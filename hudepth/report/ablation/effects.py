@@ -74,7 +74,7 @@ def _panel(axis: Axes, found: Mapping[int, Contrast]) -> None:
 
 
 def _intervals(
-    axis: Axes, places: Floats, intervals: Sequence[Interval], colours: NDArray[np.str_], **style: Any
+    axis: Axes, places: Floats, intervals: Sequence[Interval], colours: NDArray[Any], **style: Any
 ) -> tuple[NDArray[np.bool_], Floats, Floats]:
     """Draw intervals as far as they lie in the plot; return which can be seen, and the ends of all."""
     left, right = np.array([(each.low, each.high) for each in intervals]).reshape(-1, 2).T

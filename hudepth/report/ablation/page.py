@@ -48,12 +48,7 @@ def page(
 ) -> str:
     """Return report.html.
 
-    Args:
-        report: of the sweep.
-        title: of the page.
-        pictures: in their order; they become part of the page.
-        notes: one line for each thing in the folder that was left alone.
-        facts: further ones for the top of the page, like its date.
+    Pictures become part of the page; ``notes`` list what was skipped, ``facts`` join those at the top of the page.
     """
     parts = [
         ("differences", f"Differences from {report.reference.label}", _differences(report)),
@@ -150,10 +145,7 @@ def _metrics(
 
 
 def _are_numbers(shown: Sequence[str]) -> bool:
-    try:
-        return bool([float(value) for value in shown if value != ABSENT])
-    except ValueError:
-        return False
+    return all(value == ABSENT or re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", value) for value in shown)
 
 
 def _sorter(name: str, *, is_number: bool = True) -> Html:

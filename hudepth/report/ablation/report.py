@@ -45,12 +45,8 @@ def make_report(
 ) -> Report:
     """Compute a sweep's table.
 
-    Args:
-        rows: of :func:`hudepth.report.ablation.rows.sort_runs`.
-        protocol: its name.
-        reference: a row by its label or its ``variant``; default: the first that has a result.
-        repeats: of the bootstrap.
-        seed: of its draws.
+    ``reference`` is the label or the ``variant`` of a row, by default the first that has a result; ``repeats`` and
+    ``seed`` are those of the bootstrap.
 
     Raises:
         ConfigError: if there is no such row.

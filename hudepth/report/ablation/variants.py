@@ -24,12 +24,10 @@ Band = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDAr
 
 
 def draw_variants(histories: Mapping[str, Sequence[History]], *, shown: Sequence[str], monitor: str = "") -> Figure:
-    """Draw one plot per validation metric, in it one line per row.
+    """Draw one plot per validation metric, in it one line per row; ``histories`` holds metrics.csv by row and seed.
 
-    Args:
-        histories: by row, for each seed its metrics.csv.
-        shown: rows that get a colour and a name, the most important first; the others are grey.
-        monitor: the metric to draw if the histories have none of the headline metrics.
+    Rows in ``shown`` get a colour and a name, the most important first; the others are grey. ``monitor`` is drawn if
+    there is no headline metric.
     """
     known = {key for runs in histories.values() for run in runs for row in run for key in row}
     keys = [f"val/{name}" for name in metric_names("headline") if f"val/{name}" in known]
