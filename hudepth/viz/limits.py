@@ -1,4 +1,4 @@
-"""How far an axis reaches, so that one value far out does not press all others into a line."""
+"""Limits of an axis that one outlier does not stretch until all other values fall on a line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterable
 
 FAR = 12.0
-"""A value is far out if it lies so many times further from the middle than half of the values do."""
+"""A value is far out if its distance from the median exceeds this many times the median distance."""
 
 
 def usual_range(values: Iterable[float]) -> tuple[float, float]:

@@ -65,6 +65,7 @@ def test_mistakes(arguments: list[str], message: str, command: Command) -> None:
     assert re.match(f"hudepth-report: {message}", done.err.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_the_installed_script_compares_two_runs_from_another_folder(trained: Path, cache: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         **script("report", "compare", f"a={trained}", f"b={trained}", "protocol=paper", cwd=tmp_path, cache=cache),
@@ -99,6 +100,7 @@ def test_a_table_of_several_runs_says_in_what_they_differ(command: Command, trai
     assert "0.224" in done.out
 
 
+@pytest.mark.slow
 def test_compare_shows_the_images_that_differ(command: Command, trained: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(trained, other)

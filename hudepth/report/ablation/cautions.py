@@ -33,7 +33,7 @@ def unpaired(rows: Sequence[Row], reference: Row) -> list[str]:
         shared = [seed for seed in reference.runs if seed in row.runs]
         comparable = row.runs and not row.differs and not reference.differs
         if comparable and len(shared) < max(len(row.runs), len(reference.runs)):
-            only = f"are paired by seed {', '.join(shared)} alone" if shared else "have no seed in common to pair"
+            only = f"are paired by seed {', '.join(shared)} only" if shared else "have no seed in common to pair"
             lines.append(f"'{row.label}' and the reference {only}")
     return lines
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 from hudepth.metrics.catalogue import metric_info
 from hudepth.report.ablation.estimates import Contrast, Interval
@@ -14,14 +13,12 @@ MOST_PLACES = 7
 
 def places(report: Report) -> dict[str, int]:
     """Return the decimals of each metric: 4, 2 for large ones, more if the largest mean has leading zeros."""
-    return {name: _places(row.estimates[name].mean for row in report.rows if row.estimates) for name in report.metrics}
-
-
-def _places(values: Iterable[float]) -> int:
-    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-    if not largest:
-        return 4
-    return 2 if largest >= 10 else min(MOST_PLACES, max(4, 3 - math.floor(math.log10(largest))))
+    digits = {}
+    for name in report.metrics:
+        means = (abs(row.estimates[name].mean) for row in report.rows if row.estimates)
+        largest = max(filter(math.isfinite, means), default=0.0) or 1.0
+        digits[name] = 2 if largest >= 10 else min(MOST_PLACES, max(4, 3 - math.floor(math.log10(largest))))
+    return digits
 
 
 def number(value: float, digits: int, *, sign: bool = False) -> str:

@@ -32,6 +32,8 @@ def names(folder: Path) -> set[str]:
 
 
 def test_a_sweep_becomes_tables_pictures_and_a_page(command: Command, sweep: Path) -> None:
+    (sweep / "report").mkdir()
+    (sweep / "report" / "cost.png").write_bytes(b"of an earlier report, to be removed")
     done = command("report", "sweep", "dir=sweep")
     assert done.code == 0, done.err
     assert names(sweep / "report") == TABLES | {"effects.png", "curves.png", "heatmap.png"}
@@ -47,6 +49,7 @@ def test_a_sweep_becomes_tables_pictures_and_a_page(command: Command, sweep: Pat
     assert html.count("data:image/png;base64,") == 3
 
 
+@pytest.mark.slow
 def test_its_own_report_is_no_foreign_folder(command: Command, sweep: Path) -> None:
     command("report", "sweep", "dir=sweep", "panels=0")
     (sweep / "foreign").mkdir()
@@ -59,6 +62,7 @@ def test_its_own_report_is_no_foreign_folder(command: Command, sweep: Path) -> N
     assert names(sweep) >= {"foreign", "report", "paper_s1"}
 
 
+@pytest.mark.slow
 def test_reference_output_and_another_sweep_of_the_folder(command: Command, sweep: Path, tmp_path: Path) -> None:
     make_run(sweep / "late", changes={"optim.lr": 1}, table=image_table())
     text = (sweep / "sweep.yaml").read_text()
@@ -71,13 +75,6 @@ def test_reference_output_and_another_sweep_of_the_folder(command: Command, swee
     assert [row["row"] for row in rows] == list(VARIANTS)
     assert [row["reference"] for row in rows] == ["false", "false", "true", "false"]
     assert not (sweep / "report").exists()
-
-
-def test_a_picture_of_an_earlier_report_does_not_stay(command: Command, sweep: Path) -> None:
-    (sweep / "report").mkdir()
-    (sweep / "report" / "cost.png").write_bytes(b"old")
-    assert command("report", "sweep", "dir=sweep", "panels=0").code == 0
-    assert not (sweep / "report" / "cost.png").exists()
 
 
 def test_cost_is_drawn_where_networks_differ(command: Command, tmp_path: Path) -> None:
@@ -97,6 +94,7 @@ def test_a_network_that_cannot_be_built_has_no_cost(command: Command, tmp_path: 
     assert "cost.png" not in names(tmp_path / "sweep" / "report")
 
 
+@pytest.mark.slow
 def test_predictions_of_real_runs(command: Command, trained: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         shutil.copytree(trained, tmp_path / "sweep" / name)

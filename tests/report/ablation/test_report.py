@@ -173,8 +173,8 @@ def test_a_damaged_result_is_listed_with_the_reason(sweep: Path) -> None:
         f"'{sweep}/paper_s2/test/eigen' has a metrics.json but no per_image.csv. Run hudepth-test again."
     )
     assert found.warnings == [
-        "'boundary' and the reference are paired by seed 1, 3 alone",
-        "'silog' and the reference are paired by seed 1, 3 alone",
+        "'boundary' and the reference are paired by seed 1, 3 only",
+        "'silog' and the reference are paired by seed 1, 3 only",
     ]
 
 
