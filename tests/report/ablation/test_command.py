@@ -77,6 +77,7 @@ def test_reference_output_and_another_sweep_of_the_folder(command: Command, swee
     assert not (sweep / "report").exists()
 
 
+@pytest.mark.slow
 def test_cost_is_drawn_where_networks_differ(command: Command, tmp_path: Path) -> None:
     sizes: dict[str, dict[str, Any]] = {"small": {}, "large": {"data.size": [64, 96]}}
     make_sweep(tmp_path / "sweep", sizes, seeds=2)

@@ -1,4 +1,4 @@
-"""Pictures of a sweep: effects, curves, heat map, cost."""
+"""Pictures of a sweep: effects, curves, heat map."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from hudepth.report.ablation.cost import Cost, draw_cost
 from hudepth.report.ablation.effects import COLOURS, draw_effects
-from hudepth.report.ablation.estimates import Estimate, Interval
 from hudepth.report.ablation.heatmap import draw_heatmap, find_grid
 from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.variants import band, draw_variants
@@ -88,19 +86,3 @@ def test_the_heat_map_writes_each_mean_and_rings_the_best(report: Report) -> Non
     bold = [text.get_text() for text in figure.axes[0].texts if text.get_fontweight() == "bold"]
     assert bold == [f"{min(means[name] for name in order):.4f}"]
     assert len(figure.axes[0].patches) == 1
-
-
-def test_cost_has_a_point_a_row_and_keeps_those_far_out_in_sight() -> None:
-    def cost(label: str, mean: float) -> Cost:
-        return Cost(
-            label, 2_000_000, 3_000_000_000, Estimate({"1": mean}, mean, Interval(mean - 0.01, mean + 0.01), Interval())
-        )
-
-    figure = draw_cost([cost("a", 0.2), cost("b", 0.21), cost("c", 0.22), cost("d", 4.0)])
-    rendered(figure)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b", "c", "d"]
-    assert [text.get_text() for text in figure.axes[0].texts] == ["4.000"]
-    assert [axis.get_xlabel() for axis in figure.axes] == [
-        "parameters [millions]",
-        "multiply-adds per image [billions]",
-    ]
