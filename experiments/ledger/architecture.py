@@ -1,4 +1,4 @@
-"""The network beside table A1, and beside what section 3.1 says instead."""
+"""The network next to table A1, and next to what section 3.1 says instead."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Comparison:
-    """A row of table A1 beside the module that stands for it."""
+    """A row of table A1 next to the module that corresponds to it."""
 
     row: ModelRow
     shapes: list[Shape]

@@ -1,6 +1,6 @@
 """What error figures allow one another: bounds that hold for any data, any model and any averaging over images.
 
-Let truth t and prediction p lie in (0, D], and let q = max(p/t, t/p), d = |p - t|, r = d / t. Where q < Q:
+Let ground truth t and prediction p lie in (0, D], and let q = max(p/t, t/p), d = |p - t|, r = d / t. Where q < Q:
 
     d <= D (1 - 1/Q)        the larger of p and t is at most D, the smaller at least 1/Q of it
     d^2 = d t r <= D^2 (1 - 1/Q) r
@@ -41,7 +41,7 @@ def largest_rmse_m(abs_rel: float, deltas: Sequence[float], *, max_depth_m: floa
     Args:
         abs_rel: mean relative error.
         deltas: delta1 to delta3, rising.
-        max_depth_m: D, of truth and prediction.
+        max_depth_m: D, of ground truth and prediction.
         rounding: half the last printed digit, given in favour of the printed figures.
     """
     budget, total = abs_rel + rounding, 0.0

@@ -64,7 +64,7 @@ def mult_adds_by_torchinfo_rule(network: nn.Module, image: Tensor) -> dict[str, 
     Its rule: only modules without children that ran count. A convolution, transposed or not, costs its parameters
     (bias included) times batch times *output* pixels; any other module its parameters times batch, whatever number of
     tokens or pixels they are applied to. So a transposed convolution of stride 2 is counted 4 times too much, linear
-    layers once instead of once a token, and ``nn.MultiheadAttention``, whose weights lie beside a child, not at all.
+    layers once instead of once per token, and ``nn.MultiheadAttention``, whose weights lie next to a child, not at all.
 
     Args:
         network: whose weights are called ``weight`` and ``bias``, as those of PyTorch's layers are.

@@ -1,4 +1,4 @@
-"""How many test frames of a video have a training frame beside them, when frames are split at random and by scene."""
+"""How many test frames of a video have a training frame next to them, when frames are split at random and by scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def expected_share(train_fraction: float, *, within: int) -> float:
     return float(1 - (1 - train_fraction) ** (2 * within))
 
 
-def share_beside_training(split: Split, *, n: int, within: int, frames_per_scene: int | None = None) -> float:
+def share_next_to_training(split: Split, *, n: int, within: int, frames_per_scene: int | None = None) -> float:
     """Return the share of test frames with a training frame of their scene at most ``within`` frames away.
 
     Args:
@@ -49,10 +49,10 @@ def share_beside_training(split: Split, *, n: int, within: int, frames_per_scene
     is_train = np.zeros(n, dtype=bool)
     is_train[split.train] = True
     test = np.asarray(split.test)
-    beside = np.zeros(len(test), dtype=bool)
+    adjacent = np.zeros(len(test), dtype=bool)
     for distance in [*range(-within, 0), *range(1, within + 1)]:
         neighbour = test + distance
         inside = (neighbour >= 0) & (neighbour < n)
         neighbour = neighbour.clip(0, n - 1)
-        beside |= inside & is_train[neighbour] & (scene[neighbour] == scene[test])
-    return float(beside.mean())
+        adjacent |= inside & is_train[neighbour] & (scene[neighbour] == scene[test])
+    return float(adjacent.mean())

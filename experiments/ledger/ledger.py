@@ -23,7 +23,7 @@ def markdown(rows: Sequence[Row], *, table_2: Sheet, runs: Sequence[Run], enviro
 
     Args:
         rows: in the order to show.
-        table_2: the paper's table 2 with the runs beside it.
+        table_2: the paper's table 2 with the runs next to it.
         runs: what was given as evidence.
         environment: versions, device and the command.
     """

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from experiments.ledger import tables
 from experiments.ledger.bounds import largest_mean_depth_m, largest_rmse_m
-from experiments.ledger.leakage import expected_share, share_beside_training, split_frames
+from experiments.ledger.leakage import expected_share, share_next_to_training, split_frames
 from experiments.ledger.row import Row, Sheet
 from experiments.ledger.units import ERRORS, READINGS, Rooms, Score, scaling_at_eps
 from hudepth.data.encoding import INDOOR_MEDIAN_M
@@ -41,8 +41,8 @@ def leakage_row(*, frames_per_scene: int = 128) -> Row:
     by_frame, by_scene = _split("random"), _split("scene", frames_per_scene=frames_per_scene)
     for within in (1, 2):
         expected = expected_share(tables.FRACTIONS[0], within=within)
-        counted = share_beside_training(by_frame, n=n, within=within)
-        apart = share_beside_training(by_scene, n=n, within=within, frames_per_scene=frames_per_scene)
+        counted = share_next_to_training(by_frame, n=n, within=within)
+        apart = share_next_to_training(by_scene, n=n, within=within, frames_per_scene=frames_per_scene)
         values[f"within_{within}"] = {"expected": expected, "counted": counted, "scene_split": apart}
         cells.append([str(within), f"{expected:.2%}", f"{counted:.2%}", f"{apart:.2%}"])
     one, two = values["within_1"], values["within_2"]
@@ -65,7 +65,7 @@ def leakage_row(*, frames_per_scene: int = 128) -> Row:
 
 
 def ssim_and_loss_row(rooms: Rooms, scores: list[Score]) -> Row:
-    """SSIM 0.998 and loss 0.0005 beside ARE 0.063."""
+    """SSIM 0.998 and loss 0.0005 next to ARE 0.063."""
     paper, mean_depth_m = tables.PROPOSED, tables.MAX_DEPTH_M * float(rooms.unit_depth.mean())
     largest_m = {
         reading: largest_mean_depth_m(
@@ -80,7 +80,7 @@ def ssim_and_loss_row(rooms: Rooms, scores: list[Score]) -> Row:
     lowest_loss = min(s.loss for s in scores if s.reading == RIGHT and s.prediction in ERRORS)
     return Row(
         "ssim_and_loss",
-        "SSIM 0.998 and loss 0.0005 beside ARE 0.063",
+        "SSIM 0.998 and loss 0.0005 next to ARE 0.063",
         f"SSIM {tables.SSIM}, total loss {tables.LOSS_TRAIN} in training and {tables.LOSS_VAL} in validation "
         f"(section 4, figure 5), ARE {paper.abs_rel} (table 2); data range and window of SSIM not stated",
         f"On depth / 10 m, that validation loss and that ARE go together only at a mean depth below "
@@ -137,7 +137,7 @@ def _scores_sheet(scores: list[Score]) -> Sheet:
 
 
 def rmse_row(scores: list[Score]) -> Row:
-    """RMSE 0.237 beside ARE 0.063."""
+    """RMSE 0.237 next to ARE 0.063."""
     paper, at = tables.PROPOSED, {(s.reading, s.prediction): s for s in scores}
     bounds = {
         reading: largest_rmse_m(paper.abs_rel, paper.deltas, max_depth_m=tables.MAX_DEPTH_M * factor)
@@ -152,13 +152,13 @@ def rmse_row(scores: list[Score]) -> Row:
     )
     return Row(
         "rmse_and_are",
-        "RMSE 0.237 beside ARE 0.063",
+        "RMSE 0.237 next to ARE 0.063",
         f"ARE {paper.abs_rel}, RMSE {paper.rmse}, delta1 {paper.delta1} (table 2), the unit of RMSE not stated",
         f"In metres the pair is plausible: a prediction on built-in rooms with that ARE has RMSE {right:.3f} m, and "
         f"{bounds[RIGHT]:.2f} m is possible. On misread depth, at most {tables.MAX_DEPTH_M * READINGS[MISREAD]:.3f} m, "
         f"it has {misread:.4f}, and more than {bounds[MISREAD]:.3f} is impossible. {metres}",
         "The largest RMSE that any data allow, given ARE, deltas and the largest depth (derived in "
-        "hudepth/paper/bounds.py); and the RMSE of the prediction with smooth error of the row before, which depends "
+        "bounds.py); and the RMSE of the prediction with smooth error of the row before, which depends "
         "on the rooms' depths.",
         "holds" if fits_right else "cannot be",
         {"largest_rmse_m": bounds, "rmse_on_rooms_m": {RIGHT: right, MISREAD: misread}},

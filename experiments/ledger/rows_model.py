@@ -146,12 +146,12 @@ def table_3_row() -> Row:
     """Whether table 3 agrees with itself and with the text."""
     found = inconsistencies()
     text_holds = all(row.ms_per_image < 1 for row in tables.TABLE_3 if row.batch >= 4)
-    said = f"No disagreement in {len(tables.TABLE_3)} rows" if not found else "; ".join(found)
+    lines = f"No disagreement in {len(tables.TABLE_3)} rows" if not found else "; ".join(found)
     return Row(
         "table_3_arithmetic",
         "Arithmetic of table 3",
         "Images/s, batches/s and ms/image at batch 1 to 32; under 1 ms for all batches of 4 or more (section 4)",
-        f"{said} beyond rounding; 'under 1 ms' {'agrees' if text_holds else 'disagrees'} with the table",
+        f"{lines} beyond rounding; 'under 1 ms' {'agrees' if text_holds else 'disagrees'} with the table",
         "images/s = batch x batches/s and ms/image = 1000 / images/s, within what the printed digits round away.",
         "holds" if not found and text_holds else "contradicted",
         {"inconsistencies": found},
@@ -159,14 +159,14 @@ def table_3_row() -> Row:
 
 
 def speed_row(*, batches: Sequence[int], seconds: float, device_name: str) -> Row:
-    """Images a second on this device beside table 3.
+    """Images per second on this device next to table 3.
 
     Args:
         batches: batch sizes; empty to leave it out.
         seconds: for each of them.
         device_name: of the device, for the reader.
     """
-    claim, rows = "Images a second", {row.batch: row for row in tables.TABLE_3}
+    claim, rows = "Images per second", {row.batch: row for row in tables.TABLE_3}
     first, last = tables.TABLE_3[0], tables.TABLE_3[-1]
     says = (
         f"{first.images_per_s:.0f} at batch {first.batch} to {last.images_per_s:.0f} at batch {last.batch} on one "
@@ -200,7 +200,7 @@ def speed_row(*, batches: Sequence[int], seconds: float, device_name: str) -> Ro
                 for s in speeds
             ],
         },
-        [Sheet(f"Inference on {device_name}{threads}, beside table 3 (one RTX 4090)", header, cells)],
+        [Sheet(f"Inference on {device_name}{threads}, next to table 3 (one RTX 4090)", header, cells)],
     )
 
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 from experiments.ledger import tables
 from experiments.ledger.row import Row, Sheet, not_measured
-from experiments.ledger.rows_table2 import describe_test, shown
+from experiments.ledger.rows_table2 import describe_test, format_value
 from experiments.ledger.runs import Run, pairs
 
 MAIN = "eigen"
-"""The protocol whose figures are said, where there are several; tables have all."""
+"""The protocol whose figures are quoted in sentences; tables show all."""
 EDGES = ("edge_f1_0.25", "si_boundary_f1", "dbe_acc_px", "dbe_comp_px")
 """Measures of depth edges: the first two are better when high, the others when low."""
 
@@ -33,12 +33,12 @@ def accuracy_row(runs: Sequence[Run]) -> Row:
                 best[key] = (value, run)
     if not best:
         return not_measured("accuracy", claim, says, why="pass --runs <a run tested on NYU>", how=how)
-    said = []
+    found = []
     for source, split, protocol in _one_protocol_each(sorted(best)):
         if _is_nyu(source):
             value, run = best[source, split, protocol]
             where = f"{split} split of {source}, protocol {protocol}"
-            said.append(f"{value:.3f} and {shown(run.metric(protocol, 'delta1'))} ({where})")
+            found.append(f"{value:.3f} and {format_value(run.metric(protocol, 'delta1'))} ({where})")
     cells = [
         [*_tested(run, key[2]), str(run.last_epoch or "?"), str(run.training_images or "?")]
         for key, (_, run) in sorted(best.items(), key=lambda item: item[0])
@@ -48,7 +48,7 @@ def accuracy_row(runs: Sequence[Run]) -> Row:
         "accuracy",
         claim,
         says,
-        f"Best ARE and delta1 on NYU: {'; '.join(said) or 'none of the runs was tested on it'}",
+        f"Best ARE and delta1 on NYU: {'; '.join(found) or 'none of the runs was tested on it'}",
         how if reached else f"{how} The paper trained on {tables.SPLIT_COUNTS[0]:,} images, for 100 epochs by table 1.",
         "holds" if reached else "not reached",
         {
@@ -106,15 +106,15 @@ def split_effect_row(runs: Sequence[Run]) -> Row:
             cells += [_tested(run, protocol) for run in (random, other)]
             if protocol != MAIN and MAIN in common:
                 continue
-            said = (
+            found = (
                 f"On {random.tested_source(protocol)} ARE {values[0]:.3f} random, {values[1]:.3f} {other.split} "
                 f"(protocol {protocol}"
             )
             ends = random.interval(protocol, "abs_rel"), other.interval(protocol, "abs_rel")
             if ends[0] and ends[1] and ends[0][1] < ends[1][0]:
-                lower.append(f"{said}): lower, intervals apart")
+                lower.append(f"{found}): lower, intervals apart")
             else:
-                unclear.append(f"{said}): {'intervals not apart' if all(ends) else 'no intervals'}")
+                unclear.append(f"{found}): {'intervals not apart' if all(ends) else 'no intervals'}")
     if not cells:
         why = "pass --runs A B: one recipe trained with data.split=random and with data.split=scene or official"
         return not_measured("random_against_scene", claim, says, why=why, how=how)
@@ -133,7 +133,7 @@ def split_effect_row(runs: Sequence[Run]) -> Row:
 def _tested(run: Run, protocol: str) -> list[str]:
     def with_interval(name: str) -> str:
         ends = run.interval(protocol, name)
-        return shown(run.metric(protocol, name)) + (f" [{ends[0]:.3f}, {ends[1]:.3f}]" if ends else "")
+        return format_value(run.metric(protocol, name)) + (f" [{ends[0]:.3f}, {ends[1]:.3f}]" if ends else "")
 
     return [run.name, describe_test(run.tests[protocol], protocol), with_interval("abs_rel"), with_interval("delta1")]
 
@@ -149,7 +149,7 @@ def units_of_runs_row(runs: Sequence[Run]) -> Row:
         "Runs whose configurations differ in data.encoding alone, one of them paper_literal: validation SSIM (data "
         "range 1 on unit depth), total loss and abs_rel of the last epoch that both have."
     )
-    cells, said, fits = [], [], []
+    cells, found, fits = [], [], []
     for a, b in pairs(runs, "data.encoding"):
         if not (a.misread or b.misread):
             continue
@@ -157,15 +157,15 @@ def units_of_runs_row(runs: Sequence[Run]) -> Row:
         epoch = min(a.last_epoch, b.last_epoch)
         rows = [[run.at_epoch(epoch, f"val/{name}") for name in ("ssim", "loss/total", "abs_rel")] for run in both]
         for run, row, word in zip(both, rows, ("as millimetres", "rightly"), strict=True):
-            cells.append([run.name, word, str(epoch), *(shown(value, digits=4) for value in row)])
+            cells.append([run.name, word, str(epoch), *(format_value(value, digits=4) for value in row)])
         (ssim_misread, *_), (ssim_right, *_) = rows
         if ssim_misread is not None and ssim_right is not None:
-            said.append(
-                f"SSIM {ssim_misread:.3f} and loss {shown(rows[0][1], digits=4)} misread, {ssim_right:.3f} and "
-                f"{shown(rows[1][1], digits=4)} rightly read (epoch {epoch})"
+            found.append(
+                f"SSIM {ssim_misread:.3f} and loss {format_value(rows[0][1], digits=4)} misread, {ssim_right:.3f} and "
+                f"{format_value(rows[1][1], digits=4)} rightly read (epoch {epoch})"
             )
             fits.append(round(ssim_misread, 3) >= tables.SSIM > round(ssim_right, 3))
-    if not said:
+    if not found:
         why = "pass --runs A B: one recipe on 8-bit depth, with data.encoding=uint8_10m and with paper_literal"
         return not_measured("units_of_runs", claim, says, why=why, how=how)
     paper = [
@@ -181,10 +181,10 @@ def units_of_runs_row(runs: Sequence[Run]) -> Row:
         "units_of_runs",
         claim,
         says,
-        "; ".join(said) + (". The paper's SSIM appears with misread depth only" if any(fits) else ""),
+        "; ".join(found) + (". The paper's SSIM appears with misread depth only" if any(fits) else ""),
         how,
         "contradicted" if any(fits) else "measured",
-        {"found": said, "only_misread_reaches_ssim": any(fits)},
+        {"found": found, "only_misread_reaches_ssim": any(fits)},
         [Sheet("One recipe, depth read rightly and as millimetres", header, [*cells, paper])],
     )
 
@@ -195,7 +195,7 @@ def epochs_row(runs: Sequence[Run]) -> Row:
     says = f"{few} (section 4), {many} (table 1 and the text on figure 5)"
     how = f"The lowest validation abs_rel in metrics.csv up to epoch {few} and up to epoch {many}, of one run."
     longest = max((run.last_epoch for run in runs), default=0)
-    said, values = [], []
+    found, values = [], []
     for run in runs:
         upto = {
             n: [row["val/abs_rel"] for row in run.history if row["epoch"] <= n and "val/abs_rel" in row]
@@ -204,13 +204,13 @@ def epochs_row(runs: Sequence[Run]) -> Row:
         if run.last_epoch >= many and upto[few]:
             at_few, at_many = min(upto[few]), min(upto[many])
             values.append({"run": run.name, "few": at_few, "many": at_many})
-            said.append(
+            found.append(
                 f"{run.name}: ARE {at_few:.4f} by epoch {few}, {at_many:.4f} by {many} ({at_many / at_few - 1:+.1%})"
             )
-    if not said:
+    if not found:
         seen = f"; the longest passed has {longest}" if longest else ""
         return not_measured("epochs", claim, says, why=f"pass --runs <a run of {many} epochs>{seen}", how=how)
-    return Row("epochs", claim, says, "; ".join(said), how, "measured", {"runs": values})
+    return Row("epochs", claim, says, "; ".join(found), how, "measured", {"runs": values})
 
 
 def edges_row(runs: Sequence[Run]) -> Row:
@@ -222,7 +222,7 @@ def edges_row(runs: Sequence[Run]) -> Row:
         "differ in the loss alone are compared, the first measure with its intervals."
     )
     cells = [
-        [run.name, run.loss, protocol, *(shown(run.metric(protocol, name)) for name in EDGES)]
+        [run.name, run.loss, protocol, *(format_value(run.metric(protocol, name)) for name in EDGES)]
         for run in runs
         for protocol in run.tests
         if any(run.metric(protocol, name) is not None for name in EDGES)

@@ -1,4 +1,4 @@
-"""Rows on table 2: whether its figures go together, and the same table with runs beside it."""
+"""Rows on table 2: whether its figures go together, and the same table with runs next to it."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def best_row(table: Sequence[MethodRow] = tables.TABLE_2) -> Row:
             own = proposed[name]
             if value is not None and own is not None and (value < own if name in LOWER_IS_BETTER else value > own):
                 beaten.setdefault(name, []).append(f"{other.method} {value}")
-    said = "; ".join(f"{name} {proposed[name]}, but {', '.join(who)}" for name, who in beaten.items())
+    found = "; ".join(f"{name} {proposed[name]}, but {', '.join(who)}" for name, who in beaten.items())
     return Row(
         "best_of_table_2",
         "Better than all others",
         "'The proposed model outperforms the others' (caption of table 2)",
-        f"Within the table itself: {said or 'the proposed row is the best, or shares the best, of every column'}",
+        f"Within the table itself: {found or 'the proposed row is the best, or shares the best, of every column'}",
         "The last row of table 2 against each of the others, column by column, as printed.",
         "contradicted" if beaten else "holds",
         {"beaten": beaten},
@@ -39,12 +39,14 @@ def best_row(table: Sequence[MethodRow] = tables.TABLE_2) -> Row:
 def deltas_row(table: Sequence[MethodRow] = tables.TABLE_2) -> Row:
     """Whether delta1 <= delta2 <= delta3 in every row."""
     falling = [row for row in table if not rising(row.deltas)]
-    said = "; ".join(f"{row.method} {row.source}: {row.delta1}, {row.delta2}, {row.delta3}" for row in falling)
+    found = "; ".join(f"{row.method} {row.source}: {row.delta1}, {row.delta2}, {row.delta3}" for row in falling)
     return Row(
         "falling_deltas",
         "delta1, delta2, delta3 of one row",
         f"{len(table)} rows of shares of pixels within 1.25, 1.25^2 and 1.25^3 (table 2)",
-        f"Fall where they must rise in {len(falling)} of {len(table)} rows: {said}" if falling else "rise in every row",
+        f"Fall where they must rise in {len(falling)} of {len(table)} rows: {found}"
+        if falling
+        else "rise in every row",
         "A pixel within 1.25 is within 1.25^2 too, so delta1 <= delta2 <= delta3 for any data.",
         "cannot be" if falling else "holds",
         {"rows": [row.method for row in falling]},
@@ -56,7 +58,9 @@ def bounds_row(table: Sequence[MethodRow] = tables.TABLE_2) -> Row:
     cells, broken = [], []
     for row in table:
         if not rising(row.deltas):
-            cells.append([row.method, row.source, f"{row.rmse}", "-", shown(row.log10), "-", "deltas fall, see above"])
+            cells.append(
+                [row.method, row.source, f"{row.rmse}", "-", format_value(row.log10), "-", "deltas fall, see above"]
+            )
             continue
         rmse = largest_rmse_m(row.abs_rel, row.deltas, max_depth_m=tables.MAX_DEPTH_M)
         log10 = largest_log10(row.abs_rel, row.deltas, max_depth_m=tables.MAX_DEPTH_M)
@@ -68,19 +72,21 @@ def bounds_row(table: Sequence[MethodRow] = tables.TABLE_2) -> Row:
         if too_much:
             broken.append(f"{row.method} {row.source}: {' and '.join(too_much)}")
         verdict = "**cannot be**" if too_much else "possible"
-        cells.append([row.method, row.source, f"{row.rmse}", f"{rmse:.3f}", shown(row.log10), f"{log10:.3f}", verdict])
+        cells.append(
+            [row.method, row.source, f"{row.rmse}", f"{rmse:.3f}", format_value(row.log10), f"{log10:.3f}", verdict]
+        )
     header = ("method", "source", "RMSE", "largest possible", "log10", "largest possible", "verdict")
     tested = sum(rising(row.deltas) for row in table)
     return Row(
         "figures_of_one_row",
-        "RMSE and log10 beside ARE and deltas",
+        "RMSE and log10 next to ARE and deltas",
         f"{len(table)} rows compared on NYU Depth V2 (table 2), whose depth is clipped to {tables.MAX_DEPTH_M:g} m",
         f"Figures that no depth within {tables.MAX_DEPTH_M:g} m can give together: in {len(broken)} of {tested} rows"
         + (
             f". {'; '.join(broken)}. Such a row is from another data set, outdoors, or another metric" if broken else ""
         ),
-        f"Upper bounds for any data with truth and prediction from {MIN_DEPTH_M:g} to {tables.MAX_DEPTH_M:g} m, pooled "
-        "or averaged over images, printed digits rounded in the row's favour; derivation in hudepth/paper/bounds.py. "
+        f"Upper bounds for any data with ground truth and prediction from {MIN_DEPTH_M:g} to {tables.MAX_DEPTH_M:g} m, "
+        "pooled or averaged over images, printed digits rounded in the row's favour; derivation in bounds.py. "
         "'Possible' does not mean right.",
         "cannot be" if broken else "holds",
         {"broken": broken, "tested": tested},
@@ -96,22 +102,22 @@ def protocol_row(runs: Sequence[Run]) -> Row:
         known = {p: value for p, value in scored.items() if value is not None}
         for protocol in known:
             values = [run.metric(protocol, name) for name in NAMES]
-            cells.append([run.name, protocol, _stamp(run.tests[protocol]), *map(shown, values)])
+            cells.append([run.name, protocol, _stamp(run.tests[protocol]), *map(format_value, values)])
         if len(known) > 1:
             low, high = min(known, key=lambda p: known[p]), max(known, key=lambda p: known[p])
             spans.append(
                 (known[high] / known[low] - 1, f"{run.name}: ARE {known[low]:.3f} ({low}), {known[high]:.3f} ({high})")
             )
-    said = max(spans)[1] if spans else "not measured: pass --runs <a run tested under two protocols>"
+    found = max(spans)[1] if spans else "not measured: pass --runs <a run tested under two protocols>"
     sources = len({row.source for row in tables.TABLE_2}) - 1
     header = ("run", "protocol", "what it scores", *NAMES)
     return Row(
         "protocol",
         "One protocol for all rows of table 2",
-        f"{len(tables.TABLE_2) - 1} rows from {sources} cited works beside the proposed one; crop, depth cap, "
+        f"{len(tables.TABLE_2) - 1} rows from {sources} cited works next to the proposed one; crop, depth cap, "
         "resolution and test images are stated for none, and the proposed row is scored on frames of the training set "
         "(section 2.3)",
-        f"The same predictions under different protocols: {said}" if spans else said,
+        f"The same predictions under different protocols: {found}" if spans else found,
         "hudepth-test scores one checkpoint under several protocols; each metrics.json states its own in full. "
         "What the cited rows were scored on must be looked up in the works themselves.",
         "measured" if spans else "not measured",
@@ -134,14 +140,14 @@ def table_2_with_runs(runs: Sequence[Run]) -> Sheet:
             "NYU, random frames of the training set; protocol not stated"
             if row is tables.PROPOSED
             else "as cited by the paper; protocol not stated",
-            *map(shown, row.metrics().values()),
+            *map(format_value, row.metrics().values()),
         ]
         for row in tables.TABLE_2
     ]
     for run in runs:
         for protocol, test in run.tests.items():
             values = [run.metric(protocol, name) for name in NAMES]
-            cells.append([run.name, "measured", describe_test(test, protocol), *map(shown, values)])
+            cells.append([run.name, "measured", describe_test(test, protocol), *map(format_value, values)])
     return Sheet("Table 2 as printed, with the runs given to this command", header, cells)
 
 
@@ -161,6 +167,6 @@ def _stamp(test: Mapping[str, Any]) -> str:
     return f"{stamp.get('resolution', '?')} resolution, {crop}, {stamp.get('valid', '?')}"
 
 
-def shown(value: float | None, *, digits: int = 3) -> str:
+def format_value(value: float | None, *, digits: int = 3) -> str:
     """Return a number for a table; empty for None."""
     return "" if value is None else f"{value:.{digits}f}"

@@ -31,7 +31,7 @@ class Run:
     config: Mapping[str, Any]
     """Flat: dotted keys."""
     history: list[dict[str, float]]
-    """One row an epoch; empty where metrics.csv cannot be read."""
+    """One row per epoch; empty where metrics.csv cannot be read."""
     tests: dict[str, dict[str, Any]] = field(default_factory=dict)
     """metrics.json by protocol."""
     problems: list[str] = field(default_factory=list)
@@ -39,7 +39,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """As it was called, with its folder where that says more."""
+        """Its name, with the folder where that differs."""
         folder = self.path.resolve().name
         name = str(self.config.get("name", folder))
         return name if name == folder else f"{name} ({folder})"
@@ -78,7 +78,7 @@ class Run:
         return str(self.tests[protocol].get("split", {}).get("kind", "?"))
 
     def metric(self, protocol: str, name: str) -> float | None:
-        """Return a test metric of the trained network, None where there is none."""
+        """Return a test metric of the trained network, None if there is none."""
         value = _at(self.tests, protocol, "metrics", MODEL, name)
         return float(value) if _is_number(value) else None
 
@@ -90,12 +90,12 @@ class Run:
         return None
 
     def at_epoch(self, epoch: int, key: str) -> float | None:
-        """Return a value of the history at an epoch, None where there is none."""
+        """Return a value of the history at an epoch, None if there is none."""
         return next((row[key] for row in self.history if row["epoch"] == epoch and key in row), None)
 
     @property
     def last_epoch(self) -> int:
-        """0 where there is no history."""
+        """0 without a history."""
         return int(max((row["epoch"] for row in self.history), default=0))
 
 
@@ -108,7 +108,7 @@ def find_runs(paths: Sequence[str | Path]) -> list[Run]:
     Raises:
         ConfigError: if a folder does not exist or holds no run: a slip of the keyboard, found before any work.
     """
-    folders: dict[Path, Path] = {}  # as typed, each once whatever its spelling
+    folders: dict[Path, Path] = {}  # each once, however it is spelled
     for given in paths:
         path = Path(given).expanduser()
         if not path.is_dir():
@@ -119,7 +119,7 @@ def find_runs(paths: Sequence[str | Path]) -> list[Run]:
             else sorted(p.parent for level in range(1, 4) for p in path.glob(f"{'*/' * level}config.yaml"))
         )
         if not found:
-            raise ConfigError(f"runs: '{path}' is no run and holds none: there is no config.yaml at or below it.")
+            raise ConfigError(f"runs: '{path}' is not a run and contains none: there is no config.yaml at or below it.")
         folders |= {folder.resolve(): folder for folder in found if folder.resolve() not in folders}
     return [read_run(folder) for folder in folders.values()]
 
@@ -172,7 +172,7 @@ def pairs(runs: Sequence[Run], *keys: str) -> list[tuple[Run, Run]]:
 
 
 def _at(value: object, *keys: str) -> Any:
-    """Look a nested value up, None where there is none."""
+    """Look a nested value up, None if there is none."""
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
     return value

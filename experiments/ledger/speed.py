@@ -1,4 +1,4 @@
-"""Images a second on this device, and whether table 3 agrees with itself."""
+"""Images per second on this device, and whether table 3 agrees with itself."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def measure_speed(
 
     Args:
         network: in eval mode on ``device``.
-        batch: images a pass.
+        batch: images per pass.
         seconds: to spend on the timed passes.
         device: synchronised before each reading of the clock.
         side_px: of the images.

@@ -41,7 +41,7 @@ RTX_4090_TFLOPS = 82.6
 
 @dataclass(frozen=True)
 class ModelRow:
-    """A row of table A1, and the module of :class:`hudepth.models.hybrid_unet.HybridUNet` that stands for it."""
+    """A row of table A1, and the module of :class:`hudepth.models.hybrid_unet.HybridUNet` that corresponds to it."""
 
     layer: str
     shape: tuple[int, ...]
@@ -123,7 +123,7 @@ class MethodRow:
         return self.delta1, self.delta2, self.delta3
 
     def metrics(self) -> dict[str, float | None]:
-        """By name, as :mod:`hudepth.metrics.depth` calls them."""
+        """By name, as in :mod:`hudepth.metrics.depth`."""
         return {name: value for name, value in asdict(self).items() if name not in ("method", "source")}
 
 

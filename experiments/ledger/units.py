@@ -70,15 +70,15 @@ def render_rooms(*, frames: int, side_px: int) -> Rooms:
 
 
 def predictions(rooms: Rooms, *, abs_rel: float = PROPOSED.abs_rel, seed: int = 0) -> dict[str, Tensor]:
-    """Make predictions: the truth itself, three of a given relative error, and two that have seen no image.
+    """Make predictions: the ground truth itself, three of a given relative error, and two that have seen no image.
 
-    The three (:data:`ERRORS`) are truth times 1 + e, with e one number an image (``wrong scale``, of random sign), a
-    Gaussian field of about seven lumps across (``smooth error``), or drawn for each pixel (``pixel noise``); e is
-    scaled so that each image's abs_rel is exact. ``mean depth map`` and ``mean depth`` are those of the truth itself,
+    The three (:data:`ERRORS`) are the ground truth times 1 + e, with e one number per image (``wrong scale``, of random
+    sign), a Gaussian field of about seven lumps across (``smooth error``), or drawn per pixel (``pixel noise``); e is
+    scaled so that each image's abs_rel is exact. ``mean depth map`` and ``mean depth`` are those of the ground truth,
     which flatters them a little.
 
     Args:
-        rooms: the truth.
+        rooms: the ground truth.
         abs_rel: mean of |e|.
         seed: of e.
     """
@@ -102,7 +102,7 @@ def score_readings(rooms: Rooms, made: Mapping[str, Tensor]) -> list[Score]:
     """Score each prediction under each of :data:`READINGS`.
 
     Args:
-        rooms: the truth.
+        rooms: the ground truth.
         made: predictions of unit depth [b, 1, h, w].
     """
     weights = LOSS_WEIGHTS
@@ -131,7 +131,7 @@ def scaling_at_eps(rooms: Rooms, prediction: Tensor, *, eps: float) -> tuple[flo
     """Return the mean factor s of the scaling term (equation 5) and the term itself (equation 4).
 
     Args:
-        rooms: the truth.
+        rooms: the ground truth.
         prediction: unit depth [b, 1, h, w].
         eps: what is added to the sum of predictions.
     """

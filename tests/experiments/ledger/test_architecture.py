@@ -44,9 +44,9 @@ def test_a_row_that_differs_is_found() -> None:
 def test_a_network_of_another_make_does_not_agree() -> None:
     with torch.device("meta"):
         network = HybridUNet(attention_heads=4)
-        network.head_up = nn.ConvTranspose2d(64, 32, 2, stride=2)
+        network.head.up = nn.ConvTranspose2d(64, 32, 2, stride=2)
     wrong = [c.row.module for c in compare_with_table_a1(network) if not c.matches]
-    assert wrong == ["head_up"]
+    assert wrong == ["head.up"]
 
 
 def test_variants_of_the_text_by_hand() -> None:

@@ -46,7 +46,10 @@ def test_folders_without_a_run_are_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError) as error:
         find_runs([tmp_path])
-    assert str(error.value) == f"runs: '{tmp_path}' is no run and holds none: there is no config.yaml at or below it."
+    assert (
+        str(error.value)
+        == f"runs: '{tmp_path}' is not a run and contains none: there is no config.yaml at or below it."
+    )
 
 
 def test_what_is_missing_or_damaged_is_said_and_the_rest_kept(make_run: MakeRun) -> None:
