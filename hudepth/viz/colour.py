@@ -1,9 +1,9 @@
-"""Depth as colour: a fixed scale in metres, and a legend that says what it is."""
+"""The colour scales of all pictures, and depth painted on a fixed scale in metres with a legend."""
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -11,31 +11,46 @@ from jaxtyping import Float, UInt8
 
 from hudepth.base.errors import ConfigError
 
-UNMEASURED_GREY = 191
-"""Where depth is 0: a light grey that the scale does not contain."""
+if TYPE_CHECKING:
+    from matplotlib.colors import Colormap
+
+DEPTH_COLOURS = "turbo_r"
+"""Near is red, far is blue."""
+ERROR_COLOURS = "magma"
+SCORE_COLOURS = "viridis"
+"""Bright is better."""
+UNMEASURED_COLOUR, UNMEASURED_GREY = "0.75", 191
+"""A light grey that no scale contains, for matplotlib and in bytes."""
+
+
+def colour_map(name: str) -> Colormap:
+    """Return a scale as matplotlib's colour map; masked values are grey."""
+    from matplotlib import colormaps
+
+    return colormaps[name].with_extremes(bad=UNMEASURED_COLOUR)
 
 
 def colour_depth(
     depth_m: Float[np.ndarray, "h w"], *, scale_m: tuple[float, float], legend: bool = True
 ) -> UInt8[np.ndarray, "h w2 3"]:
-    """Paint depth on a fixed scale: near is red, far is blue (turbo, reversed).
+    """Paint depth on a fixed scale, :data:`DEPTH_COLOURS`.
 
     Args:
         depth_m: metres, 0 where unmeasured.
-        scale_m: depths of the two ends; what lies beyond has the colour of the end.
-        legend: whether a scale in metres is joined to the right.
+        scale_m: depths of the two ends; depths beyond them are clipped.
+        legend: whether to append a scale in metres on the right.
 
     Returns:
-        RGB; wider than the depth by the legend.
+        RGB, wider than the depth by the legend.
 
     Raises:
-        ConfigError: if the scale is not two rising numbers.
+        ConfigError: if the scale is not two increasing numbers.
     """
-    near, far = _checked(scale_m)
-    shade = cv2.convertScaleAbs(depth_m - near, alpha=255 / (far - near)) if near else None
-    if shade is None:
-        shade = cv2.convertScaleAbs(depth_m, alpha=255 / far)  # rounds and clips at 255 by itself
-    else:
+    near, far = (float(end) for end in scale_m)
+    if not 0 <= near < far < np.inf:
+        raise ConfigError(f"scale_m: {scale_m} is not two increasing depths in metres. Pass scale_m=[0,10].")
+    shade = cv2.convertScaleAbs(depth_m - near if near else depth_m, alpha=255 / (far - near))  # rounds, clips at 255
+    if near:
         shade[depth_m < near] = 0
     picture = cv2.applyColorMap(shade, _colours())
     if not depth_m.all():
@@ -45,23 +60,16 @@ def colour_depth(
     return np.hstack([picture, _legend(depth_m.shape[0], near, far)])
 
 
-def _checked(scale_m: tuple[float, float]) -> tuple[float, float]:
-    near, far = float(scale_m[0]), float(scale_m[1])
-    if not 0 <= near < far < np.inf:
-        raise ConfigError(f"scale_m: {scale_m} is not two rising distances in metres. Pass scale_m=[0,10].")
-    return near, far
-
-
 @lru_cache(maxsize=1)
 def _colours() -> UInt8[np.ndarray, "256 1 3"]:
-    """Return turbo from far to near, as a table for OpenCV whose channels are RGB."""
+    """Return the depth scale as a lookup table for OpenCV, in RGB."""
     ramp = np.arange(256, dtype=np.uint8)[::-1, None]
     return np.ascontiguousarray(cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)[..., ::-1])
 
 
 @lru_cache(maxsize=8)
 def _legend(height: int, near: float, far: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw the scale, as high as the picture beside it; a folder of pictures of one size needs one."""
+    """Draw the scale, as high as the picture; pictures of one size share it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Pictures of predictions: RGB, truth, prediction and error side by side, on one metre scale."""
+"""Pictures of predictions: RGB, ground truth, prediction and error side by side, on one scale in metres."""
 
 from __future__ import annotations
 
@@ -8,23 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from hudepth.base.files import written_whole
+from hudepth.viz.colour import DEPTH_COLOURS, ERROR_COLOURS, colour_map
 
-DEPTH_COLOURS = "turbo_r"
-"""Near is red, far is blue."""
-ERROR_COLOURS = "magma"
-UNMEASURED_COLOUR = "0.75"
-"""Light grey, which neither scale contains."""
 MIN_SPAN_M = 0.1
-"""No scale is narrower than this."""
+"""Least width of a scale."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +35,10 @@ class Panel:
 
 
 def draw_panels(panels: Sequence[Panel]) -> NDArray[np.uint8]:
-    """Draw one row a panel: RGB, truth, prediction, absolute error.
+    """Draw one row per panel: RGB, ground truth, prediction, absolute error.
 
-    All depths share one scale, from the smallest to the largest truth, and all errors another, up to the 99th
-    percentile, so that rows compare.
+    Rows share a depth scale, from the smallest to the largest ground truth, and an error scale, up to the 99th
+    percentile.
 
     Args:
         panels: at least one.
@@ -70,7 +64,7 @@ def save_figure(path: Path, figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> Figure:
-    """Show names as they are written: between two dollar signs matplotlib reads a formula, and fails if it is none."""
+    """Turn off formulas: matplotlib parses text between dollar signs, and fails if it is not a formula."""
     for text in figure.findobj(Text):
         text.set_parse_math(False)
     return figure
@@ -79,33 +73,30 @@ def _literal(figure: Figure) -> Figure:
 def _figure(panels: Sequence[Panel]) -> Figure:
     measured = np.concatenate([panel.truth_m[panel.truth_m > 0] for panel in panels])
     low, high = (float(measured.min()), float(measured.max())) if measured.size else (0.0, 1.0)
-    if high - low < MIN_SPAN_M:  # one depth everywhere: a scale of no width would name no depth
+    if high - low < MIN_SPAN_M:  # one depth everywhere
         low, high = max(0.0, low - MIN_SPAN_M / 2), low + MIN_SPAN_M / 2
     errors = [np.ma.masked_where(panel.truth_m <= 0, np.abs(panel.pred_m - panel.truth_m)) for panel in panels]
     wrongs = np.concatenate([error.compressed() for error in errors])
     wrongs = wrongs[np.isfinite(wrongs)]
-    worst = max(MIN_SPAN_M, float(np.percentile(wrongs, 99))) if wrongs.size else 1.0  # outliers darken the rest
+    worst = max(MIN_SPAN_M, float(np.percentile(wrongs, 99))) if wrongs.size else 1.0  # not the maximum
 
     figure, cells, bars = _layout(len(panels), aspect=panels[0].image.shape[0] / panels[0].image.shape[1])
     for title, cell in zip(("image", "truth", "prediction", "absolute error"), cells[0], strict=True):
         cell.set_title(title, fontsize=11, pad=5)
-    depth_scale: dict[str, Any] = {"cmap": _colours(DEPTH_COLOURS), "vmin": low, "vmax": high}
+    depth_scale: dict[str, Any] = {"cmap": colour_map(DEPTH_COLOURS), "vmin": low, "vmax": high}
     for row, panel, error in zip(cells, panels, errors, strict=True):
         row[0].imshow(panel.image)
         row[1].imshow(np.ma.masked_where(panel.truth_m <= 0, panel.truth_m), **depth_scale)
         depth = row[2].imshow(panel.pred_m, **depth_scale)
-        wrong = row[3].imshow(error, cmap=_colours(ERROR_COLOURS), vmin=0, vmax=worst)
-        row[0].set_ylabel(_shortened(panel.title, row[0]), fontsize=8)
+        wrong = row[3].imshow(error, cmap=colour_map(ERROR_COLOURS), vmin=0, vmax=worst)
+        row[0].set_ylabel(_shorten(panel.title, row[0]), fontsize=8)
     figure.colorbar(depth, cax=bars[0], orientation="horizontal", extend="both", label="depth [m]")
     figure.colorbar(wrong, cax=bars[1], orientation="horizontal", extend="max", label="absolute error [m]")
     return figure
 
 
 def _layout(rows: int, *, aspect: float) -> tuple[Figure, list[list[Axes]], list[Axes]]:
-    """Return a figure with ``rows`` of four cells and, below, the axes of the two scales.
-
-    Everything is placed in inches: with rows of any number and shape, gaps, letters and scales keep their size.
-    """
+    """Return a figure, its rows of four cells, and the axes of the two scales below; all placed in inches."""
     cell, gap, left, top, bottom, bar = 2.6, 0.07, 0.3, 0.32, 0.62, 0.11
     width = left + 4 * cell + 3 * gap + 0.1
     height = top + rows * (cell * aspect + gap) + bottom
@@ -123,20 +114,16 @@ def _layout(rows: int, *, aspect: float) -> tuple[Figure, list[list[Axes]], list
         axis.set_xticks([])
         axis.set_yticks([])
     y = bottom - bar - 0.02
-    inset = 0.2  # between a scale's ends and the columns it belongs to
+    inset = 0.2  # of a scale's ends from its columns
     bars = [axes(x[1] + inset, y, 2 * cell + gap - 2 * inset, bar), axes(x[3] + inset, y, cell - 2 * inset, bar)]
     for scale in bars:
         scale.tick_params(labelsize=9)
     return figure, cells, bars
 
 
-def _colours(name: str) -> Colormap:
-    return colormaps[name].with_extremes(bad=UNMEASURED_COLOUR)
-
-
-def _shortened(title: str, axis: Axes) -> str:
-    """Cut the front of a title that is longer than its row is high: frame numbers stand at the end."""
+def _shorten(title: str, axis: Axes) -> str:
+    """Cut the front of a title that is longer than its row is high; frame numbers are at the end."""
     figure = axis.get_figure()
     assert figure is not None
-    room = int(axis.get_position().height * figure.bbox.height / figure.dpi * 15)  # letters of 8 points
+    room = int(axis.get_position().height * figure.bbox.height / figure.dpi * 15)  # 15 letters of 8 points per inch
     return title if len(title) <= room else f"…{title[len(title) - room + 1 :]}"

@@ -49,8 +49,7 @@ def point_cloud(
     Args:
         depth_m: distance along the optical axis [m].
         image: RGB of the same size, for colour.
-        intrinsics: of the camera, in pixels of ``depth_m``; NYU's scaled to its size by default, which the comment
-            says.
+        intrinsics: of the camera, in pixels of ``depth_m``; default: those of NYU, scaled to its size.
     """
     height, width = depth_m.shape
     camera = intrinsics or Intrinsics.of_nyu(height, width)

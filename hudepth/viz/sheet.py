@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from hudepth.viz.panels import DEPTH_COLOURS, MIN_SPAN_M, UNMEASURED_COLOUR, Panel
+from hudepth.viz.colour import DEPTH_COLOURS, colour_map
+from hudepth.viz.panels import MIN_SPAN_M, Panel
 
 
 def draw_sheet(predictions: Mapping[str, Sequence[Panel]], *, titles: Sequence[str] = ()) -> Figure:
@@ -23,7 +23,7 @@ def draw_sheet(predictions: Mapping[str, Sequence[Panel]], *, titles: Sequence[s
     measured = np.concatenate([panel.truth_m[panel.truth_m > 0] for panel in first])
     low, high = (float(measured.min()), float(measured.max())) if measured.size else (0.0, 1.0)
     scale: dict[str, Any] = {"vmin": low, "vmax": max(high, low + MIN_SPAN_M)}
-    scale["cmap"] = colormaps[DEPTH_COLOURS].with_extremes(bad=UNMEASURED_COLOUR)
+    scale["cmap"] = colour_map(DEPTH_COLOURS)
     truths = [np.ma.masked_where(panel.truth_m <= 0, panel.truth_m) for panel in first]
     rows: dict[str, Sequence[Any]] = {"image": [panel.image for panel in first], "ground truth": truths}
     rows |= {name: [panel.pred_m for panel in panels] for name, panels in predictions.items()}

@@ -1,4 +1,4 @@
-"""Errors by depth, distance to an edge, region and category: a plot a group."""
+"""Errors by depth, distance to an edge, region and category: one plot per group."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hudepth.metrics.strata import Stratum
 from hudepth.viz.panels import save_figure
 
 RARE = 0.01
-"""A bin with a smaller share of its group's pixels is drawn pale and does not set the scale."""
+"""A bin with a smaller share of its group's pixels is drawn pale and does not set the limits."""
 
 
 def draw_strata(rows: Sequence[Stratum], *, title: str = "") -> Figure:
-    """Draw abs_rel of each bin as a bar, the bin's share of the pixels beside its name.
+    """Draw abs_rel of each bin as a bar, and the bin's share of the pixels next to its name.
 
     Args:
         rows: bins of any number of groups, those of a group together; at least one.
@@ -40,10 +40,10 @@ def draw_strata(rows: Sequence[Stratum], *, title: str = "") -> Figure:
 
 def _draw_group(axis: Axes, rows: Sequence[Stratum], *, right: float) -> None:
     for place, row in enumerate(rows):
-        # no bar where it is NaN or infinite, but the number
+        # no bar for NaN or infinity, only the number
         length = row.abs_rel if math.isfinite(row.abs_rel) else 0.0
         axis.barh(place, length, height=0.72, color="tab:blue", alpha=1 if row.share >= RARE else 0.35)
-        # a bar that leaves the picture carries its number inside
+        # a bar longer than the axis has its number inside
         end, side = (length, "left") if length < 0.9 * right else (right, "right")
         axis.annotate(f" {row.abs_rel:.3f} ", (end, place), ha=side, va="center", fontsize=8)
     labels = [f"{row.label.replace('_', ' ')}   {_percent(row.share)}" for row in rows]

@@ -63,6 +63,7 @@ def net() -> TinyUNet:
     return TinyUNet(channels=4).eval()
 
 
+@pytest.mark.slow
 def test_the_batch_size_changes_nothing(cache: Path, net: TinyUNet) -> None:
     reference = evaluate(make_data(cache, batch_size=1), {"model": net}, PAPER, NATIVE)
     for batch_size in (2, 4, 50):

@@ -112,7 +112,7 @@ def eigen_pixels(pred_m: Tensor, batch: Batch) -> list[tuple[F64, F64]]:
 
 
 def test_eigen_protocol() -> None:
-    pred_m, batch = make_batch(50)
+    pred_m, batch = make_batch(4)
     protocol = Protocol(**EIGEN)
     sums = score(protocol, pred_m, batch)
     pixels = eigen_pixels(pred_m, batch)
@@ -125,8 +125,10 @@ def test_eigen_protocol() -> None:
 
 
 def test_eigen_protocol_is_what_the_configuration_says() -> None:
-    text = resources.files("hudepth.conf").joinpath("protocol/eigen.yaml").read_text(encoding="utf-8")
-    options = yaml.safe_load(text)
+    files = [resources.files("hudepth.conf").joinpath(name) for name in ("base/protocol.yaml", "protocol/eigen.yaml")]
+    base, own = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
+    options = {**base, **own}
+    assert options.pop("defaults") == ["/base/protocol@_here_", "_self_"]
     assert options.pop("_target_") == "hudepth.metrics.protocol.Protocol"
     pred_m, batch = make_batch()
     ours, theirs = Protocol(**EIGEN), Protocol(**options)

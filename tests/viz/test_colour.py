@@ -40,5 +40,5 @@ def test_the_legend_stands_beside_it_and_is_the_same_for_every_picture(height: i
 
 @pytest.mark.parametrize("scale", [(3, 3), (5, 1), (-1, 2), (0, float("inf")), (0, float("nan"))])
 def test_a_scale_that_is_none(scale: tuple[float, float]) -> None:
-    with pytest.raises(ConfigError, match=r"is not two rising distances in metres. Pass scale_m=\[0,10\]"):
+    with pytest.raises(ConfigError, match=r"^scale_m: .* Pass scale_m="):
         colour_depth(np.ones((2, 2), np.float32), scale_m=scale)

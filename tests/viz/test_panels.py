@@ -13,7 +13,8 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from hudepth.viz import panels as module
-from hudepth.viz.panels import DEPTH_COLOURS, ERROR_COLOURS, Panel, draw_panels, save_figure, save_panels
+from hudepth.viz.colour import DEPTH_COLOURS, ERROR_COLOURS
+from hudepth.viz.panels import Panel, draw_panels, save_figure, save_panels
 
 GREY = np.full(3, 191)  # of unmeasured pixels: 0.75 of 255
 F32 = NDArray[np.float32]
@@ -58,7 +59,7 @@ def centre(cell: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cell[len(cell) // 2, cell.shape[1] // 2]
 
 
-@pytest.mark.parametrize("rows", [1, 2, 6])
+@pytest.mark.parametrize("rows", [1, 2])
 def test_a_picture_is_rgb(rows: int) -> None:
     picture = draw_panels([make_panel()] * rows)
     assert picture.dtype == np.uint8
@@ -69,10 +70,9 @@ def test_a_picture_is_rgb(rows: int) -> None:
 
 
 def test_each_row_adds_the_same_height() -> None:
-    heights = [len(draw_panels([make_panel()] * rows)) for rows in (1, 2, 3, 6)]
+    heights = [len(draw_panels([make_panel()] * rows)) for rows in (1, 2, 4)]
     step = heights[1] - heights[0]
-    assert heights[2] - heights[1] == pytest.approx(step, abs=1)
-    assert heights[3] - heights[2] == pytest.approx(3 * step, abs=2)
+    assert heights[2] - heights[1] == pytest.approx(2 * step, abs=2)
 
 
 def test_what_stands_where(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,8 +130,8 @@ def test_the_scale_is_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [axis.get_title() for axis in picture.figure.axes[:4]] == ["image", "truth", "prediction", "absolute error"]
 
 
-@pytest.mark.parametrize("shape", [(24, 32), (32, 24), (32, 32), (16, 64)])
-@pytest.mark.parametrize("rows", [1, 6])
+@pytest.mark.parametrize("shape", [(24, 32), (32, 24), (16, 64)])
+@pytest.mark.parametrize("rows", [1, pytest.param(6, marks=pytest.mark.slow)])
 def test_nothing_is_cut_off_and_nothing_overlaps(
     monkeypatch: pytest.MonkeyPatch, rows: int, shape: tuple[int, int]
 ) -> None:

@@ -67,5 +67,5 @@ def test_nyu_stands_in_for_a_camera_that_nobody_stated_and_the_file_says_so() ->
 
 @pytest.mark.parametrize("values", [(0.0, 1.0, 0.0, 0.0), (1.0, float("nan"), 0.0, 0.0), (1.0, 1.0, float("inf"), 0.0)])
 def test_no_camera(values: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match=r"is no camera. Pass intrinsics=\[fx,fy,cx,cy\] in pixels of the image"):
+    with pytest.raises(ConfigError, match=r"^intrinsics: .* Pass intrinsics="):
         Intrinsics(*values)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -17,6 +16,7 @@ from hudepth.metrics.catalogue import metric_info
 from hudepth.report.ablation.factors import format_value
 from hudepth.report.ablation.rows import Row
 from hudepth.runs.identity import canonical
+from hudepth.viz.colour import SCORE_COLOURS, colour_map
 from hudepth.viz.limits import usual_range
 from hudepth.viz.style import ORANGE, strip_frame
 
@@ -85,7 +85,8 @@ def draw_heatmap(grid: Grid, *, metric: str = "abs_rel") -> Figure:
     low, high = usual_range(known)
     best = (max if info.higher_is_better else min)(known, default=math.nan)
     scale: dict[str, Any] = {"vmin": low, "vmax": high if high > low else low + 1e-3}
-    scale["cmap"] = colormaps["viridis" if info.higher_is_better else "viridis_r"].with_extremes(bad=EMPTY)
+    name = SCORE_COLOURS if info.higher_is_better else f"{SCORE_COLOURS}_r"
+    scale["cmap"] = colour_map(name).with_extremes(bad=EMPTY)
     for axis, panel in zip(axes, grid.panels, strict=True):
         values = np.array([[means.get((panel, y, x), math.nan) for x in grid.xs] for y in grid.ys])
         drawn = axis.imshow(values, aspect="auto", **scale)
