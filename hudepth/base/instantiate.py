@@ -32,8 +32,20 @@ def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type =
     Raises:
         ConfigError: if a target is not trusted, is no such class, or does not take its arguments.
     """
-    prefixes = (*TRUSTED, *(f"{name.rstrip('.')}." for name in trust))
-    return _build(config, prefixes, only, args, extra)
+    return _build(config, _prefixes(trust), only, args, extra)
+
+
+def find_class(target: str, *, trust: Iterable[str] = ()) -> type:
+    """Import the class that a ``_target_`` names.
+
+    Raises:
+        ConfigError: if it is not trusted, or there is no such class.
+    """
+    return _locate(target, _prefixes(trust))
+
+
+def _prefixes(trust: Iterable[str]) -> tuple[str, ...]:
+    return (*TRUSTED, *(f"{name.rstrip('.')}." for name in trust))
 
 
 def has_target(config: Mapping[str, Any] | None) -> bool:

@@ -1,71 +1,84 @@
-"""hudepth-data: prepare a depth store, show what is known of a data set, or audit it."""
+"""hudepth-data: prepare a depth store, describe a data set, or audit it."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
-from hudepth.base.errors import ConfigError, DataError
-from hudepth.base.options import plain
+from hudepth.base.errors import DataError
+from hudepth.base.options import parse, plain
+from hudepth.base.tables import Table
 from hudepth.data.audit.run_audit import audit
 from hudepth.data.build import build_data
+from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.prepare import store_path
+from hudepth.data.sources.base import Record
 from hudepth.data.splits import SUBSETS, make_split
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """Options of hudepth-data, as in ``conf/data.yaml``."""
+
+    verb: Literal["prepare", "info", "audit"]
+    data: Mapping[str, Any]
+    trust: list[str]
 
 
 def data(cfg: DictConfig) -> None:
     """Run the verb ``prepare``, ``info`` or ``audit``.
 
     Args:
-        cfg: what conf/data.yaml and the command line compose to.
+        cfg: composed from conf/data.yaml and the command line.
 
     Raises:
         HudepthError: with one line for the user.
     """
     config = plain(cfg)
-    datamodule = build_data(config["data"], trust=config["trust"])
-    if config["verb"] == "prepare":
-        store = datamodule.store
-        print(f"{len(store)} pairs in {store.path}")
-        return
-    if config["verb"] == "audit":
+    options = parse(DataOptions, config)
+    datamodule = build_data(options.data, trust=options.trust)
+    if options.verb == "audit":
         audit(config, datamodule)
-        return
-    if config["verb"] != "info":
-        raise ConfigError(
-            f"verb: no '{config['verb']}'. Use hudepth-data prepare, hudepth-data info or hudepth-data audit."
-        )
+    elif options.verb == "info":
+        _describe(datamodule).show(show_header=False)
+    else:
+        print(f"{len(datamodule.store)} pairs in {datamodule.store.path}")
+
+
+def _describe(datamodule: DepthDataModule) -> Table:
     source = datamodule.source
     records = source.records()
-    table = Table(title=f"{source.name}", show_header=False, title_justify="left")
-    table.add_row("pairs", f"{len(records):,}")
-    table.add_row("scenes", f"{len({record.scene for record in records}):,}")
+    table = Table(("", ""), title=source.name, left=2)
+    table.add("pairs", f"{len(records):,}")
+    table.add("scenes", f"{len({record.scene for record in records}):,}")
     own = Counter(record.split or "none" for record in records)
-    table.add_row("the set's own split", ", ".join(f"{n:,} {name}" for name, n in sorted(own.items())))
-    categories = Counter(record.category for record in records if record.category).most_common(6)
-    if categories:
-        table.add_row("categories", ", ".join(f"{n:,} {name}" for name, n in categories))
+    table.add("official split", ", ".join(f"{n:,} {name}" for name, n in sorted(own.items())))
+    if categories := Counter(record.category for record in records if record.category).most_common(6):
+        table.add("categories", ", ".join(f"{n:,} {name}" for name, n in categories))
     for kind in ("random", "scene", "official"):
-        table.add_row(f"split={kind}", _counts(records, kind, datamodule.split_seed, datamodule.fractions))
-    table.add_row("fingerprint", source.fingerprint()[:16])
+        table.add(f"split={kind}", _counts(records, kind, datamodule.split_seed, datamodule.fractions))
+    table.add("fingerprint", source.fingerprint()[:16])
+    if source.homepage:
+        table.add("homepage", source.homepage)
     path = store_path(source, size=datamodule.size, native=datamodule.native, cache=datamodule.cache.expanduser())
-    if path.exists():
-        info = datamodule.store.info
-        table.add_row("depth", f"{info['depth_min_m']} to {info['depth_max_m']} m, median {info['depth_median_m']} m")
-        table.add_row("measured", f"{100 * info['valid_fraction']:.1f} % of pixels")
-        table.add_row("skipped", str(len(info["skipped"])))
-        table.add_row("store", f"{path} ({path.stat().st_size / 1e6:.0f} MB)")
-    else:
-        table.add_row("store", "not prepared yet: hudepth-data prepare")
-    Console(width=None if Console().is_terminal else 130).print(table)
+    if not path.exists():
+        table.add("store", "not prepared yet: hudepth-data prepare")
+        return table
+    info = datamodule.store.info
+    table.add("depth", f"{info['depth_min_m']} to {info['depth_max_m']} m, median {info['depth_median_m']} m")
+    table.add("measured", f"{100 * info['valid_fraction']:.1f} % of pixels")
+    table.add("skipped", str(len(info["skipped"])))
+    table.add("store", f"{path} ({path.stat().st_size / 1e6:.0f} MB)")
+    return table
 
 
-def _counts(records: object, kind: str, seed: int, fractions: tuple[float, ...]) -> str:
+def _counts(records: Sequence[Record], kind: str, seed: int, fractions: Sequence[float]) -> str:
     try:
-        split = make_split(records, kind=kind, seed=seed, fractions=fractions)  # type: ignore[arg-type]
+        split = make_split(records, kind=kind, seed=seed, fractions=fractions)
     except DataError:
         return "not possible"
     return ", ".join(f"{len(split[name]):,} {name}" for name in SUBSETS)

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hudepth import __version__
+from hudepth.base.errors import ConfigError
+from hudepth.base.instantiate import find_class
 from hudepth.base.tables import Table
+from hudepth.data.sources.base import Source
 from hudepth.inference.model_info import ModelInfo
 from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.runs.checkpoint import Checkpoint
 
-NYU = (
-    "NYU Depth V2 (Silberman, Hoiem, Kohli, Fergus: Indoor Segmentation and Support Inference from RGBD Images, "
-    "ECCV 2012); its authors publish it for research and state no licence for other uses."
-)
-DATA_LICENCES = {
-    "rooms": "Synthetic rooms that hudepth ray-casts itself (MIT, like hudepth): no photograph was used.",
-    "nyu_labeled": NYU,
-    "nyu_labeled_mat": NYU,
-    "nyu_raw": NYU,
-    "densedepth": NYU,
-}
-"""By source: what the training data is and what its owners allow."""
 CITATION = """@article{turkmen2025hybrid,
   title   = {A Hybrid UNet with Attention and a Perceptual Loss Function for Monocular Depth Estimation},
   author  = {Turkmen, Hamidullah and Akgun, Devrim},
@@ -37,7 +28,7 @@ CITATION = """@article{turkmen2025hybrid,
 
 def model_card(
     checkpoint: Checkpoint, info: ModelInfo, *, name: str, results: Mapping[str, Mapping[str, Any]], parity: str,
-    samples: int = 0, origin: str = "", half: bool = False,
+    samples: int = 0, origin: str = "", half: bool = False, trust: Iterable[str] = (),
 ) -> str:  # fmt: skip
     """Write the card of a model.
 
@@ -50,25 +41,35 @@ def model_card(
         samples: number of sample pictures.
         origin: of the samples, for example ``test images of nyu_labeled``.
         half: kernels and matrices are stored as 16-bit floats, and there is no ONNX file.
+        trust: packages whose data sets may be imported for their terms.
 
     Returns:
         Markdown with the header that model hubs read.
     """
-    source = str(checkpoint.data.get("source", "unknown"))
+    source, data_set = str(checkpoint.data.get("source", "unknown")), _source_class(checkpoint, trust)
     sections = (
-        _header(source, onnx=not half), f"# {name}", _about(info), _use(info, parity, half=half),
+        _header(data_set.licence, onnx=not half), f"# {name}", _about(info), _use(info, parity, half=half),
         _training(checkpoint, source), _results(results), _samples(samples, origin), _limits(info, source),
         "## Licence\n\nCode: MIT. Training data: "
-        + DATA_LICENCES.get(source, f"'{source}', whose terms the publisher of this model must state here.")
+        + (data_set.terms or f"'{source}', whose terms the publisher of this model must state here.")
         + " What this means for the weights is for you to judge.",
         f"## How to cite\n\nhudepth {__version__}, and the paper it implements:\n\n```bibtex\n{CITATION}\n```",
     )  # fmt: skip
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def _header(source: str, *, onnx: bool) -> str:
+def _source_class(checkpoint: Checkpoint, trust: Iterable[str]) -> type[Source]:
+    """Return the class of the training data; the base class, which states no terms, if it cannot be imported."""
+    target = checkpoint.config.get("data", {}).get("source", {}).get("_target_", "")
+    try:
+        found = find_class(str(target), trust=trust)
+    except ConfigError:
+        return Source
+    return found if issubclass(found, Source) else Source
+
+
+def _header(licence: str, *, onnx: bool) -> str:
     tags = "\n".join(f"- {tag}" for tag in ("depth-estimation", "monocular-depth", *["onnx"] * onnx, "hudepth"))
-    licence = "mit" if source == "rooms" else "other"
     return f"---\nlibrary_name: hudepth\npipeline_tag: depth-estimation\nlicense: {licence}\ntags:\n{tags}\n---"
 
 

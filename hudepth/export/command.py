@@ -209,7 +209,7 @@ def _bundle(work: Work) -> dict[str, Any]:
     info, folder = replace(work.info, processing=True), work.folder / name
     card = model_card(
         work.checkpoint, info, name=name, results=results, parity=str(parity), half=options.half,
-        samples=len(samples), origin=images.origin,
+        samples=len(samples), origin=images.origin, trust=options.trust,
     )  # fmt: skip
     write_bundle(folder, kept, info=info, onnx=onnx, card=card, results=results, samples=samples)
     if options.zip:

@@ -186,4 +186,4 @@ def test_a_split_that_cannot_be_made_is_said_so(command: Command, tmp_path: Path
 
 def test_the_verb_is_one_of_three(command: Command) -> None:
     done = command("data", "verb=adit")
-    assert "verb: no 'adit'" in done.err.splitlines()[-1]
+    assert "verb: 'adit' is not one of" in done.err.splitlines()[-1]
