@@ -19,13 +19,10 @@ from hudepth.runs.status import LockedError, read_status, write_status
 
 
 def run_job(cfg: DictConfig) -> None:
-    """Train as one job of a sweep.
+    """Call :func:`hudepth.training.command.train` as one job of a sweep.
 
     Errors end up in the run's status and log and are never raised, so that the other jobs continue. Output goes to
     train.log; only warnings reach the terminal.
-
-    Args:
-        cfg: of the job, as for :func:`hudepth.training.command.train`.
     """
     path = Path(HydraConfig.get().runtime.output_dir)
     path.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
 
@@ -17,28 +17,19 @@ from hudepth.sweep.jobs import Job, find_done
 from hudepth.sweep.progress import say
 from hudepth.training.study import TRIAL_ENV, import_optuna, open_study
 
-if TYPE_CHECKING:
-    import optuna
-
-
 STUDY_FILE = "study.log"
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """The group ``hydra.sweeper.search``."""
+    """The group ``hydra.sweeper.search``; conf/hydra/sweeper/hudepth.yaml explains each option."""
 
     trials: Annotated[int, Range(1)] | None = None
-    """In all, with those of earlier calls; None for no search."""
     sampler: Literal["tpe", "random"] = "tpe"
     seed: Annotated[int, Range(0)] = 0
-    """Of the sampler."""
     startup_trials: Annotated[int, Range(0)] = 8
-    """Random trials before the sampler learns from them, and before any is pruned."""
     prune: bool = True
-    """End a trial whose metric is worse than the median of the others at the same epoch."""
     warmup_epochs: Annotated[int, Range(0)] = 2
-    """Epochs before a trial can be pruned."""
 
 
 def search(
@@ -112,9 +103,7 @@ def distribution(override: Override) -> Any:
     raise ConfigError(f"'{override.input_line}': pass interval(low,high), range(first,end,step) or choice(a,b).")
 
 
-def _next_trials(
-    study: optuna.study.Study, space: Mapping[str, Any], at_once: int, wanted: int
-) -> list[optuna.trial.Trial]:
+def _next_trials(study: Any, space: Mapping[str, Any], at_once: int, wanted: int) -> list[Any]:
     """Return the trials that were killed, or new ones while there are fewer than wanted."""
     trial = import_optuna().trial
     every = study.get_trials(deepcopy=False)
@@ -123,7 +112,7 @@ def _next_trials(
     return [study.ask(dict(space)) for _ in range(min(at_once, wanted - len(every)))]
 
 
-def _job(trial: optuna.trial.Trial, constants: Sequence[str], folder: Path) -> Job:
+def _job(trial: Any, constants: Sequence[str], folder: Path) -> Job:
     values = {key: _format_value(value) for key, value in trial.params.items()}
     env = f"+hydra.job.env_set.{TRIAL_ENV}='{trial.number}:{folder / STUDY_FILE}'"
     labels = {"trial": str(trial.number), **{key.lstrip("+~"): value for key, value in values.items()}}
@@ -134,7 +123,7 @@ def _format_value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _tell(study: optuna.study.Study, job: Job, folder: Path) -> bool:
+def _tell(study: Any, job: Job, folder: Path) -> bool:
     """Report a trial's end to the study, and return whether it has ended; one that was interrupted stays open."""
     states = import_optuna().trial.TrialState
     state = read_state(folder / job.folder)[0] if job.config is not None else FAILED
@@ -148,12 +137,8 @@ def _tell(study: optuna.study.Study, job: Job, folder: Path) -> bool:
     return True
 
 
-def _say_best(study: optuna.study.Study, folder: Path, *, monitor: str) -> None:
-    """Print the best trials.
-
-    Raises:
-        ConfigError: if none finished.
-    """
+def _say_best(study: Any, folder: Path, *, monitor: str) -> None:
+    """Print the best trials; at least one must have finished."""
     states = import_optuna().trial.TrialState
     trials = study.get_trials(deepcopy=False)
     done = [trial for trial in trials if trial.state == states.COMPLETE]

@@ -23,10 +23,8 @@ from hudepth.viz.panels import draw_panels, save_panels
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:
-    """Return what was logged for the epoch that ends now, by name.
-
-    Lightning keeps the values of the last validation; in an epoch without one they belong to an earlier epoch.
-    """
+    """Return what was logged for the epoch that ends now, by name."""
+    # without a validation in this epoch, Lightning still has the values of an earlier one
     validated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
     metrics = sorted(trainer.callback_metrics.items())
     return {name: value.item() for name, value in metrics if validated or not name.startswith("val/")}
@@ -114,15 +112,13 @@ class Interrupt(Callback):
         if threading.current_thread() is threading.main_thread():
             self._before = signal.signal(signal.SIGINT, self._ask)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, *_: Any, **__: Any) -> None:
         """Restore the handler that was there before."""
         if self._before is not None:
             signal.signal(signal.SIGINT, self._before)
             self._before = None
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Restore the handler that was there before."""
-        self.on_train_end(trainer, pl_module)
+    on_exception = on_train_end
 
     def _ask(self, number: int, frame: Any) -> None:
         if self._asked:
@@ -130,14 +126,12 @@ class Interrupt(Callback):
         self._asked = True
         log.warning("stopping after this batch; Ctrl-C again stops at once")
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+    def on_train_batch_end(self, *_: Any, **__: Any) -> None:
         """Stop, if asked to."""
         if self._asked or _is_orphan():
             raise KeyboardInterrupt
 
-    def on_validation_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Stop, if asked to."""
-        self.on_train_batch_end(trainer, pl_module)
+    on_validation_batch_end = on_train_batch_end
 
 
 def _is_orphan() -> bool:

@@ -36,13 +36,7 @@ LOCK_TIMEOUT_S = 30
 
 
 def train(cfg: DictConfig) -> float | None:
-    """Train as configured, or resume a run; then test the best checkpoint.
-
-    Args:
-        cfg: composed from conf/train.yaml and the command line.
-
-    Returns:
-        The best value of the monitored metric.
+    """Train as configured, or resume a run; test the best checkpoint; return the best value of the monitored metric.
 
     Raises:
         HudepthError: with one line for the user, which the run's status and log repeat.
@@ -111,14 +105,6 @@ def _run(training: Training) -> float | None:
     try:
         _write_status(path, "running")
         best = fit(training)
-    except HudepthError as error:
-        _write_failure(path, str(error))
-        raise
-    except OSError as error:
-        _write_failure(path, str(error))
-        raise ConfigError(
-            f"{error.strerror or error} ('{error.filename or path}'). See {path / 'train.log'}."
-        ) from error
     except Pruned as pruned:
         _write_status(path, "pruned", best=pruned.value)
         log.info("%s", pruned)
@@ -128,8 +114,12 @@ def _run(training: Training) -> float | None:
         log.info("interrupted; resume with: hudepth-train resume=%s", path)
         raise KeyboardInterrupt from None  # Lightning raises SystemExit, whose exit code would be that of an error
     except BaseException as error:
-        _write_failure(path, f"{type(error).__name__}: {error}")
-        raise
+        expected = isinstance(error, HudepthError | OSError)
+        _write_failure(path, str(error) if expected else f"{type(error).__name__}: {error}")
+        if not isinstance(error, OSError):
+            raise
+        why = f"{error.strerror or error} ('{error.filename or path}')"
+        raise ConfigError(f"{why}. See {path / 'train.log'}.") from error
     _write_status(path, "finished", best=best)
     return best
 

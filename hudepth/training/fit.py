@@ -84,11 +84,7 @@ def build_network(training: Training, data: DepthDataModule) -> nn.Module:
 
 @torch.inference_mode()
 def check_input(net: nn.Module, sizes: list[tuple[int, int]]) -> None:
-    """Pass one image of each size through the network, before hours go into preparing data.
-
-    Args:
-        net: to be trained.
-        sizes: (height, width) of the stages of the training in pixels; the last one is ``data.size``.
+    """Pass one image of each (height, width) in pixels through the network; the last one is ``data.size``.
 
     Raises:
         HudepthError: the network's own, if it does not take a size.
@@ -126,7 +122,7 @@ def build_module(
         config: of the run.
         net: to be trained.
         datamodule: its data.
-        trust: further modules whose classes may be named.
+        trust: further modules whose classes a ``_target_`` may name.
         before: what the initial weights were trained on.
 
     Raises:

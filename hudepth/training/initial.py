@@ -23,13 +23,11 @@ Parents = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Training:
-    """What is to be trained, and where."""
+    """A configuration and the options parsed from it, and the run directory (``path``)."""
 
     config: dict[str, Any]
     options: TrainOptions
-    """Of the configuration."""
     path: Path
-    """The run directory."""
     overrides: list[str] | None = None
     """Command-line overrides of a run that is resumed; None for a new run."""
     alone: bool = False

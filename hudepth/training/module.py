@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -33,11 +32,10 @@ def loss_name(stage: str, term: str = "total") -> str:
 
 
 class _Step(NamedTuple):
-    """A training step whose loss was not checked yet."""
+    """A training step whose loss was not checked yet; ``rows`` are the positions of its pairs in the depth store."""
 
     batch_idx: int
     rows: Tensor
-    """Positions of its pairs in the depth store."""
     total: Tensor
     emptied: Tensor
 
@@ -72,14 +70,11 @@ class DepthModule(LightningModule):
         record: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.net = net
-        self.loss = loss
-        self.distill = distill
-        self.max_depth_m = max_depth_m
+        self.net, self.loss, self.distill, self.max_depth_m = net, loss, distill, max_depth_m
         self.val_metrics = validation_metrics(max_depth_m=max_depth_m, prefix="val/")
         self._make_optimizer, self._make_scheduler = optimizer, scheduler
         self._record = record or {}
-        self._unchecked: deque[_Step] = deque()
+        self._unchecked: list[_Step] = []
         self._emptied: list[_Step] = []  # in this epoch
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
@@ -140,32 +135,27 @@ class DepthModule(LightningModule):
         """Check the remaining losses and the weights, before anything is saved."""
         self._check_losses()
         self._check_emptied()
-        finite = torch.stack([parameter.detach().isfinite().all() for parameter in self.net.parameters()]).all()
-        if not bool(finite):
+        if not bool(torch.stack([each.detach().isfinite().all() for each in self.net.parameters()]).all()):
             raise TrainingError(
                 f"weights are no longer finite after epoch {self.current_epoch + 1} (step {self.trainer.global_step}). "
                 f"{self._last_good()} Lower optim.lr, or train with trainer.precision=32-true."
             )
 
     def _check_losses(self) -> None:
-        """Check the losses of the steps that were not checked yet."""
-        pending = list(self._unchecked)
-        self._unchecked.clear()
-        bad = [~step.total.isfinite() | step.emptied for step in pending]
-        if not bad or not bool(torch.stack(bad).any()):
+        """Check the losses of the steps that were not checked yet, with one transfer from the device if all is well."""
+        pending, self._unchecked = self._unchecked, []
+        if not pending or not bool(torch.stack([~step.total.isfinite() | step.emptied for step in pending]).any()):
             return
-        for step in pending:
-            if not bool(step.total.isfinite()):
-                raise TrainingError(
-                    f"the loss is {step.total.item()} {self._where(step)}. {self._last_good()} "
-                    "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
-                )
+        if bad := next((step for step in pending if not bool(step.total.isfinite())), None):
+            raise TrainingError(
+                f"the loss is {bad.total.item()} {self._where(bad)}. {self._last_good()} "
+                "Look at these pairs, lower optim.lr, or train with trainer.precision=32-true."
+            )
         self._emptied += [step for step in pending if bool(step.emptied)]
 
     def _check_emptied(self) -> None:
         """Stop if augmentation leaves most batches without ground truth; single batches may lose it."""
-        emptied, batches = self._emptied, int(self.trainer.num_training_batches)
-        self._emptied = []
+        emptied, self._emptied, batches = self._emptied, [], int(self.trainer.num_training_batches)
         if 2 * len(emptied) > batches:
             raise TrainingError(
                 f"augmentation left no measured pixel in {len(emptied)} of {batches} batches, first "
@@ -182,9 +172,8 @@ class DepthModule(LightningModule):
     def _last_good(self) -> str:
         """Name the last checkpoint, which was written before anything became NaN."""
         paths = [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]
-        if not paths:
-            return "No epoch was finished, so there is no checkpoint."
-        return f"The last good checkpoint is '{paths[-1]}', of epoch {self.current_epoch}."
+        found = f"The last good checkpoint is '{paths[-1]}', of epoch {self.current_epoch}." if paths else ""
+        return found or "No epoch was finished, so there is no checkpoint."
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, the schedule."""
@@ -209,7 +198,6 @@ class DepthModule(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the configuration and the split, and averaged weights in place of the trained ones if there are any."""
-        averaged = averaged_state(self._trainer, checkpoint)
-        if averaged is not None:
+        if (averaged := averaged_state(self._trainer, checkpoint)) is not None:
             checkpoint["state_dict"] = averaged
         checkpoint[ckpt.KEY] = {"version": ckpt.VERSION, **self._record}

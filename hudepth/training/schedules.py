@@ -52,7 +52,7 @@ class WarmupCosine(StepSchedule):
     Args:
         optimizer: whose rates are changed.
         total_steps: of the whole training.
-        warmup: share of the training in which the rate rises.
+        warmup: share of the training in which the rate rises, in [0, 1).
         final: the rate at the end over the highest, in [0, 1].
 
     Raises:

@@ -6,15 +6,12 @@ import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hudepth.base.errors import ConfigError, Pruned
 from hudepth.training.callbacks import epoch_metrics
-
-if TYPE_CHECKING:
-    import optuna
 
 STUDY = "hudepth"
 TRIAL_ENV = "HUDEPTH_TRIAL"
@@ -30,8 +27,7 @@ class TrialPruner(Callback):
     """
 
     def __init__(self, trial: str, *, monitor: str) -> None:
-        import optuna
-
+        optuna = import_optuna()
         number, _, file = trial.partition(":")
         study = open_study(file)
         trial_id = next(each for each in study.get_trials(deepcopy=False) if each.number == int(number))._trial_id
@@ -51,9 +47,7 @@ class TrialPruner(Callback):
             raise Pruned(f"pruned after epoch {epoch}: {self.monitor} {value:.4f} is worse than in other trials", value)
 
 
-def open_study(
-    file: str, options: Mapping[str, Any] | None = None, *, direction: str = "minimize"
-) -> optuna.study.Study:
+def open_study(file: str, options: Mapping[str, Any] | None = None, *, direction: str = "minimize") -> Any:
     """Open or create a study in a journal file, which many processes may write to and a kill cannot damage.
 
     Args:
@@ -64,7 +58,7 @@ def open_study(
     Raises:
         ConfigError: if optuna is not installed, or the file is not a study.
     """
-    optuna_ = import_optuna()
+    optuna = import_optuna()
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
@@ -74,9 +68,7 @@ def open_study(
             with Path(file).open(encoding="utf-8") as lines:
                 json.loads(next(lines, "{}"))
         storage = JournalStorage(JournalFileBackend(file, lock_obj=JournalFileOpenLock(file)))
-        study: optuna.study.Study = optuna_.create_study(
-            storage=storage, study_name=STUDY, load_if_exists=True, direction=direction
-        )
+        study = optuna.create_study(storage=storage, study_name=STUDY, load_if_exists=True, direction=direction)
         if options is not None:
             study.set_user_attr("options", dict(options))
         chosen = study.user_attrs["options"]
@@ -85,23 +77,16 @@ def open_study(
     except Exception as error:
         why = " ".join(str(error).split())
         raise ConfigError(f"search: '{file}' cannot be resumed as a study ({why}). Pass another sweep_dir.") from error
-    pruners, samplers = optuna_.pruners, optuna_.samplers
+    pruners, samplers = optuna.pruners, optuna.samplers
     startup, warmup = chosen["startup_trials"], chosen["warmup_epochs"]
     study.pruner = pruners.MedianPruner(startup, warmup) if chosen["prune"] else pruners.NopPruner()
-    study.sampler = (
-        samplers.RandomSampler(seed=seed)
-        if chosen["sampler"] == "random"
-        else samplers.TPESampler(seed=seed, n_startup_trials=startup, constant_liar=True)
-    )
+    tpe = samplers.TPESampler(seed=seed, n_startup_trials=startup, constant_liar=True)
+    study.sampler = samplers.RandomSampler(seed=seed) if chosen["sampler"] == "random" else tpe
     return study
 
 
 def import_optuna() -> Any:
-    """Return the optuna package.
-
-    Raises:
-        ConfigError: if it is not installed.
-    """
+    """Return the optuna package, or raise a ConfigError that suggests how to install it."""
     try:
         import optuna
     except ImportError:

@@ -26,12 +26,7 @@ from hudepth.training.times import Times
 
 
 def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthDataModule) -> list[Callback]:
-    """Build the callbacks of a run: history before checkpoints, which hold it.
-
-    Args:
-        config: of the run.
-        path: its directory.
-        datamodule: its data.
+    """Build the callbacks of a run in a directory: history before checkpoints, which hold it.
 
     Raises:
         ConfigError: if one cannot be built.
@@ -59,13 +54,7 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
 
 
 def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Callback], *, alone: bool) -> Trainer:
-    """Build the Trainer of a run.
-
-    Args:
-        config: of the run.
-        path: its directory.
-        callbacks: see :func:`build_callbacks`.
-        alone: one process, whatever cluster it runs on.
+    """Build the Trainer of a run; ``alone`` means one process, whatever cluster it runs on.
 
     Raises:
         ConfigError: if Lightning refuses an option.
@@ -75,14 +64,9 @@ def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Cal
     if options["tensorboard"]:
         loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
     return build_trainer(
-        config["trainer"],
-        logger=loggers or False,
-        callbacks=callbacks,
+        config["trainer"], logger=loggers or False, callbacks=callbacks,
         plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if alone else [])],
-        default_root_dir=path,
-        enable_model_summary=False,
-        enable_progress_bar=shows_progress(),
-        num_sanity_val_steps=0,
+        default_root_dir=path, enable_model_summary=False, enable_progress_bar=shows_progress(), num_sanity_val_steps=0,
         use_distributed_sampler=False,  # the data module divides the pairs among processes itself, exactly
         log_every_n_steps=1,  # everything is logged per epoch; a larger number only makes Lightning warn
-    )
+    )  # fmt: skip
