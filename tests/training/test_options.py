@@ -38,7 +38,7 @@ def test_options_that_old_runs_lack_have_defaults(config: dict[str, Any]) -> Non
         ("seed", "abc", "whole number"), ("seed", -1, "at least 0"), ("seed", True, "whole number"),
         ("mode", "mni", "Did you mean 'min'"), ("memory_format", "channels_lst", "Did you mean 'channels_last'"),
         ("compile", "maybe", "true or false"), ("test", 1, "true or false"), ("name", "../x", "folder"),
-        ("name", None, "text"), ("callbacks.panels", -1, "at least 0"), ("callbacks.panels", 1.5, "whole number"),
+        ("name", None, "not set"), ("callbacks.panels", -1, "at least 0"), ("callbacks.panels", 1.5, "whole number"),
         ("callbacks.panels_every_n_epochs", 0, "at least 1"), ("callbacks.extra", 3, "list"),
         ("logger.tensorboard", "no", "true or false"), ("trainer.accumulate_grad_batches", 0, "at least 1"),
         ("trainer.gradient_clip_val", -1, "at least 0"), ("trainer.precision", "bf16-true", "loses updates"),
