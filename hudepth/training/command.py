@@ -13,26 +13,33 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hudepth.base.console import log
 from hudepth.base.devices import is_first_process
-from hudepth.base.errors import ConfigError, HudepthError, Pruned
+from hudepth.base.errors import CheckpointError, ConfigError, HudepthError, Pruned
 from hudepth.base.launched import shared_path
 from hudepth.base.options import plain
 from hudepth.runs import run_dir
+from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.environment import environment
-from hudepth.runs.run import CHECKPOINTS, LAST
+from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
+from hudepth.runs.run import CHECKPOINTS, LAST, read_config
 from hudepth.runs.status import lock_run, write_status
 from hudepth.training.fit import fit
 from hudepth.training.initial import Training
 from hudepth.training.options import TrainOptions, parse_options
-from hudepth.training.resume import resumed_config
 
 RUN_ENV = "HUDEPTH_RUN"
 """Holds the run directory that the first process of a distributed run made, for the others."""
 LOCK_TIMEOUT_S = 30
 """How long to wait for another process to leave a run directory; one whose sweep was killed ends after its batch."""
+
+PARTS = (
+    "seed", "monitor", "mode", "data", "model", "loss", "optim", "schedule", "trainer", "callbacks", "logger",
+    "protocol",
+)  # fmt: skip
+"""Groups and keys that the configuration of every training has."""
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -70,6 +77,50 @@ def _new(cfg: DictConfig) -> Training:
     path = _run_path(config, options)
     begun = (path / CHECKPOINTS / LAST).is_file()  # a job of a sweep that is resumed
     return Training(config, options, path, [] if begun else None, alone=_in_sweep())
+
+
+def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
+    """Return the configuration of a run to resume.
+
+    The run directory may come from somebody else, so the classes that it trusts are not trusted here: only ``trust=``
+    on the command line counts.
+
+    Args:
+        path: the run directory.
+        overrides: from the command line, for example ``["resume=runs/x", "trainer.max_epochs=50"]``.
+
+    Raises:
+        CheckpointError: if it is not a run, or has no checkpoint to resume from.
+        ConfigError: if an override cannot change any more.
+    """
+    config = read_config(path)
+    if lacking := [part for part in PARTS if part not in config]:
+        raise CheckpointError(f"resume: '{path}' is not a training run: its config.yaml has no '{lacking[0]}'.")
+    last = path / CHECKPOINTS / LAST
+    if not last.is_file():
+        raise CheckpointError(f"resume: '{path}' has no finished epoch to resume from. Train again without resume=.")
+    read_plain(last)
+    epochs = config["trainer"].get("max_epochs")
+    resumed = OmegaConf.create({**config, "trust": []})
+    for override in overrides:
+        key, _, value = override.partition("=")
+        key = key.lstrip("+")
+        if key == "resume":
+            continue
+        found = OmegaConf.select(resumed, key, default=resumed)
+        if not is_below(key, RESUMABLE) or OmegaConf.is_dict(found):  # a group, or a key that the run does not have
+            raise ConfigError(
+                f"resume: '{override}' cannot be changed when a run is resumed; trainer.max_epochs and other "
+                "values of trainer, callbacks and logger can. Start a new run for anything else."
+            )
+        OmegaConf.update(resumed, key, OmegaConf.from_dotlist([f"value={value}"])["value"])
+    result = plain(resumed)
+    if result["trainer"].get("max_epochs") != epochs and (part := part_bound_to_length(config)):
+        raise ConfigError(
+            f"resume: {part} of this run is laid out over {epochs} epochs, so trainer.max_epochs cannot change. "
+            "Start a new run, or use schedule=constant and data.progressive=null from the start."
+        )
+    return result
 
 
 def _overrides() -> list[str]:
