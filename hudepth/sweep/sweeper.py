@@ -23,7 +23,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.machine import usable_cores
@@ -51,20 +51,15 @@ class Sweep(Sweeper):
         search: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.params, self.search = dict(params or {}), search or {}
-        self.variants = {
-            str(name): [str(each) for each in overrides or ()] for name, overrides in (variants or {}).items()
-        }
+        self.params, self.search = dict(params or {}), dict(search or {})
+        self.variants = {str(name): list(map(str, each or ())) for name, each in (variants or {}).items()}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Store what Hydra provides."""
         self.context, self.task, self.master = hydra_context, task_function, config
 
     def sweep(self, arguments: list[str]) -> None:
-        """Run all jobs that are not finished.
-
-        Args:
-            arguments: the overrides of the command line.
+        """Run all jobs that are not finished; ``arguments`` are the overrides of the command line.
 
         Raises:
             HudepthError: if nothing can run, or at the end, if a job failed.
@@ -77,8 +72,7 @@ class Sweep(Sweeper):
         typed = parser.parse_overrides(list(arguments))
         params = parser.parse_overrides([f"{key}={value}" for key, value in self.params.items()])
         overrides = merge_overrides(typed, params)
-        given: Any = OmegaConf.to_container(OmegaConf.create(dict(self.search)), resolve=True)
-        options = parse(SearchOptions, given, prefix="hydra.sweeper.search.", strict=True)
+        options = parse(SearchOptions, self.search, prefix="hydra.sweeper.search.", strict=True)
         if options.trials is not None:
             with _lock_sweep(folder):
                 search(
