@@ -154,7 +154,7 @@ def test_mistakes_in_a_search_give_one_line(command: Command, tmp_path: Path) ->
     trials = "hydra.sweeper.search.trials=1"
     cases = {
         ("loss=l1", trials): "search: nothing to search over. Give a key a range, as in ",
-        (SPACE, trials, "+hydra.sweeper.search.trails=2"): "hydra.sweeper.search: no 'trails'. Did you mean 'trials'?",
+        (SPACE, trials, "+hydra.sweeper.search.trails=2"): "hydra.sweeper.search.trails: no such option.",
         ("optim.lr=choice(-1,-2)", trials): "search: none of 1 trials finished. See ",
     }  # fmt: skip
     for number, (arguments, message) in enumerate(cases.items()):
@@ -164,9 +164,7 @@ def test_mistakes_in_a_search_give_one_line(command: Command, tmp_path: Path) ->
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd" / "study.log").write_text("no study\n")
     done = searched(command, SPACE, "hydra.sweeper.search.trials=1", "sweep_dir=odd")
-    assert re.search(
-        r"hudepth-train: search: '.*/odd/study\.log' is no study that can go on \(.*\)\. Pass another", done.err
-    )
+    assert re.search(r"hudepth-train: search: '.*/odd/study\.log' cannot be resumed", done.err)
     assert (tmp_path / "odd" / "study.log").read_text() == "no study\n"
 
 
