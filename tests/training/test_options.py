@@ -46,7 +46,7 @@ def test_options_that_old_runs_lack_have_defaults(config: dict[str, Any]) -> Non
     ],
 )  # fmt: skip
 def test_mistakes(config: dict[str, Any], key: str, value: Any, word: str) -> None:
-    with pytest.raises(ConfigError, match=rf"^{key}: .*{word}"):
+    with pytest.raises(ConfigError, match=rf"^{key}:? .*{word}"):
         parse_options(changed(config, key, value))
 
 
