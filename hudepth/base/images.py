@@ -51,7 +51,7 @@ class Photo(NamedTuple):
     """What was done to it that its owner may want to know."""
 
 
-def read_photo(source: str | Path | bytes, *, where: str = "") -> Photo:
+def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int = MAX_PIXELS) -> Photo:
     """Decode an image and turn it upright as its orientation tag says.
 
     Grey, 16-bit, CMYK and palette images become 8-bit RGB; what is transparent is laid on white; of an animation the
@@ -60,6 +60,7 @@ def read_photo(source: str | Path | bytes, *, where: str = "") -> Photo:
     Args:
         source: a path, or the bytes of a file.
         where: names the file in errors; the path by default.
+        max_pixels: larger images are refused before they are decoded.
 
     Raises:
         DataError: if it is missing, empty, truncated, damaged, too large, or no image.
@@ -70,7 +71,7 @@ def read_photo(source: str | Path | bytes, *, where: str = "") -> Photo:
         raise DataError(f"{where}: the file is empty (0 bytes). Copy it again.")
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-            check_pixels(image.height, image.width, where=where)
+            check_pixels(image.height, image.width, where=where, most=max_pixels)
             notes = _notes(image)
             image.load()
             rgb = _to_rgb(image, where)
@@ -147,15 +148,15 @@ def read_bytes(path: Path) -> bytes:
         raise DataError(f"'{path}': cannot be read ({error.strerror}). Check its permissions.") from None
 
 
-def check_pixels(height: int, width: int, *, where: str) -> None:
-    """Accept sizes of 1 to :data:`MAX_PIXELS` pixels.
+def check_pixels(height: int, width: int, *, where: str, most: int = MAX_PIXELS) -> None:
+    """Accept sizes of 1 to ``most`` pixels.
 
     Raises:
         DataError: for any other size.
     """
-    if not 0 < height * width <= MAX_PIXELS:
+    if not 0 < height * width <= most:
         raise DataError(
-            f"{where}: {width} x {height} pixels, allowed are 1 to {MAX_PIXELS // 10**6} million. Resize the file."
+            f"{where}: {width} x {height} pixels, allowed are 1 to {most / 1e6:g} million. Resize the file."
         )
 
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import base64
-import io
 import time
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
-from numpy.typing import NDArray
-from PIL import Image
 
 from hudepth.base.camera import Intrinsics
 from hudepth.base.errors import DataError
-from hudepth.base.images import FORMATS, read_photo, resize_image
+from hudepth.base.images import read_photo, resize_image
 from hudepth.data.store import to_mm
 from hudepth.inference.depth_files import jpeg
 from hudepth.inference.depth_map import DepthMap
@@ -63,7 +59,8 @@ def answer(path: Path, model: DepthModel, limits: Limits, intrinsics: Intrinsics
         DataError: with one line for the visitor.
     """
     start = time.perf_counter()
-    photo = read_photo(read_upload(path, limits), where=f"'{path.name}'")
+    data = _read_upload(path, limits.upload_bytes)
+    photo = read_photo(data, where=f"'{path.name}'", max_pixels=limits.pixels)
     depth = replace(model.predict(photo.rgb), notes=photo.notes)
     shown = reduce_depth(depth)
     (height, width), (rows, columns) = depth.metres.shape, shown.metres.shape
@@ -80,52 +77,29 @@ def answer(path: Path, model: DepthModel, limits: Limits, intrinsics: Intrinsics
     return Answer(path.stem[:80], depth, shown, camera, payload)
 
 
-def read_upload(path: Path, limits: Limits) -> bytes:
-    """Return the bytes of an uploaded file within the limits; only its header is decoded.
-
-    Raises:
-        DataError: if it is missing, or has too many bytes or pixels.
-    """
+def _read_upload(path: Path, max_bytes: int) -> bytes:
     where = f"'{path.name}'"
     try:
         size = path.stat().st_size
-        if size > limits.upload_bytes:
-            most = f"{limits.upload_bytes / 2**20:g}"
-            raise DataError(f"{where}: {size / 2**20:.1f} MB, the limit is {most}. Resize the picture.")
-        data = path.read_bytes()
+        if size > max_bytes:
+            raise DataError(f"{where}: {size / 2**20:.1f} MB, the limit is {max_bytes / 2**20:g}. Resize the picture.")
+        return path.read_bytes()
     except OSError as error:
         raise DataError(f"{where}: cannot be read ({error.strerror}). Choose the picture again.") from None
-    width, height = _stated_size(data)
-    if width * height > limits.pixels:
-        most = f"{limits.pixels / 1e6:g} million"
-        raise DataError(f"{where}: {width} x {height} pixels, the limit is {most}. Resize the picture.")
-    return data
-
-
-def _stated_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) from the header, or zeros if there is none: decoding reports that."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                return image.size
-    except Exception:
-        return 0, 0
 
 
 def reduce_depth(depth: DepthMap, max_side: int = MAX_SIDE) -> DepthMap:
     """Return a depth map with sides of at most ``max_side`` pixels: depth is picked, colours are averaged."""
-    height, width = depth.metres.shape
-    shrink = max(height, width) / max_side
+    shape = depth.metres.shape
+    shrink = max(shape) / max_side
     if shrink <= 1:
         return depth
-    rows, columns = max(1, round(height / shrink)), max(1, round(width / shrink))
-    picked = depth.metres[np.ix_(_centres(height, rows), _centres(width, columns))]
-    return DepthMap(picked, resize_image(depth.image, (rows, columns)), depth.max_depth_m, depth.notes)
-
-
-def _centres(length: int, count: int) -> NDArray[np.intp]:
-    return ((np.arange(count) + 0.5) * (length / count)).astype(np.intp)
+    rows, columns = (max(1, round(length / shrink)) for length in shape)
+    centres = [
+        ((np.arange(n) + 0.5) * (length / n)).astype(np.intp) for n, length in zip((rows, columns), shape, strict=True)
+    ]
+    image = resize_image(depth.image, (rows, columns))
+    return DepthMap(depth.metres[np.ix_(*centres)], image, depth.max_depth_m, depth.notes)
 
 
 def colour_table() -> UInt8[np.ndarray, "256 3"]:

@@ -17,7 +17,7 @@ from hudepth.base.images import MAX_PIXELS
 from hudepth.base.options import Range, parse, plain
 from hudepth.demo.answers import Limits, answer
 from hudepth.demo.server import free_port, serve
-from hudepth.inference.model import DepthModel, ModelOptions, load_model
+from hudepth.inference.model import ModelOptions, load_model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +51,10 @@ def demo(cfg: DictConfig) -> None:
     model.predict(np.zeros((*model.info.size, 3), np.uint8))  # the first run is slow; visitors should not wait for it
 
     def ready(address: str) -> None:
-        log.info("model: %s; open %s (Ctrl-C stops)", describe(model), address)
+        log.info("model: %s; open %s (Ctrl-C stops)", model.info, address)
 
     serve(
         partial(answer, model=model, limits=limits, intrinsics=camera),
         host=options.host, port=options.port, limits=limits, info=model.info, ready=ready,
         camera="as given" if camera else "NYU Depth V2's, since intrinsics= is not set",
     )  # fmt: skip
-
-
-def describe(model: DepthModel) -> str:
-    """Return a short description of a model."""
-    info = model.info
-    source = info.trained_on.get("source", "unknown data")
-    size = f"{info.size[0]} x {info.size[1]}"
-    return f"{info.name}, trained on {source}, {size}, up to {info.max_depth_m:g} m, in {model.backend.name}"

@@ -117,11 +117,9 @@ def _viewer() -> gr.HTML:
 
 def headline(info: ModelInfo, camera: str) -> str:
     """Return the headline: which model this is, and how far to trust its numbers."""
-    source = escape(str(info.trained_on.get("source") or "unknown data"))
     return (
         '<div class="hd-head"><h1>Depth from one picture</h1><p>'
-        f"{escape(info.name)}, {info.parameters / 1e6:.2f} million parameters, trained on {source} for {info.epoch} "
-        f"epochs, predicts 0 to {info.max_depth_m:g} m. Camera of the point cloud: {escape(camera)}. "
+        f"{escape(str(info))}. Camera of the point cloud: {escape(camera)}. "
         "Do not trust the metres in pictures unlike the training data.</p></div>"
     )
 

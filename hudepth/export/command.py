@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -76,20 +75,12 @@ class Work:
     folder: Path
     """Where files are made before they are checked."""
 
-    @cached_property
-    def onnx(self) -> Path:
-        """The ONNX file with processing inside, from which other formats start."""
-        path = self.folder / "processed.onnx"
-        export_onnx(self.net, path, info=replace(self.info, processing=True))
+    def onnx(self, info: ModelInfo) -> Path:
+        """Return an ONNX file, from which other formats start, with or without processing as ``info`` states."""
+        path = self.folder / f"processing_{info.processing}.onnx"
+        if not path.exists():
+            export_onnx(self.net, path, info=info)
         return path
-
-    @cached_property
-    def configured_onnx(self) -> Path:
-        """The ONNX file with or without processing, as configured."""
-        if self.info.processing:
-            return self.onnx
-        export_onnx(self.net, self.folder / "plain.onnx", info=self.info)
-        return self.folder / "plain.onnx"
 
     def compare(self, path: Path, *, backend: str) -> Parity:
         """Compare a file with the checkpoint; raises CheckpointError if it differs by more than the tolerance."""
@@ -135,10 +126,7 @@ def export(cfg: DictConfig) -> None:
     output = output_folder(options.output)
     if "bundle" in options.format:
         _bundle_name(checkpoint, options)  # before minutes of work
-    log.info(
-        "%s of %s parameters, %d x %d; compared on %d %s",
-        info.name, f"{info.parameters:,}", *info.size, len(images.compared), images.origin,
-    )  # fmt: skip
+    log.info("model: %s; compared on %d %s", info, len(images.compared), images.origin)
     info = replace(info, processing=options.processing)
     record: dict[str, Any] = {}
     try:
@@ -158,7 +146,7 @@ def export(cfg: DictConfig) -> None:
 
 def _onnx(work: Work) -> dict[str, Any]:
     path = work.folder / "model.onnx"
-    shutil.copyfile(work.configured_onnx, path)
+    shutil.copyfile(work.onnx(work.info), path)
     return work.keep(path, parity=work.compare(path, backend="onnxruntime"))
 
 
@@ -170,15 +158,15 @@ def _torch_export(work: Work) -> dict[str, Any]:
 
 def _openvino(work: Work) -> dict[str, Any]:
     path = work.folder / "model.xml"
-    export_openvino(work.configured_onnx, path, info=work.info)
+    export_openvino(work.onnx(work.info), path, info=work.info)
     return work.keep(path, path.with_suffix(".bin"), parity=work.compare(path, backend="openvino"))
 
 
 def _int8(work: Work) -> dict[str, Any]:
     options, images = work.options, work.images
     check_calibration(len(images.calibration))
-    path = work.folder / "model_int8.xml"
-    quantise(work.onnx, path, info=replace(work.info, processing=True), images=images.calibration)
+    path, info = work.folder / "model_int8.xml", replace(work.info, processing=True)
+    quantise(work.onnx(info), path, info=info, images=images.calibration)
     quantised = open_exported(path, backend="openvino", threads=usable_cores(), trust=[])
     parity = compare(quantised, work.reference, images.compared)
     accuracy: dict[str, Any] = {}
@@ -195,18 +183,18 @@ def _int8(work: Work) -> dict[str, Any]:
 
 def _bundle(work: Work) -> dict[str, Any]:
     options, images = work.options, work.images
-    name = _bundle_name(work.checkpoint, options)
+    name, info = _bundle_name(work.checkpoint, options), replace(work.info, processing=True)
     if options.half:
         kept, onnx = halve(work.checkpoint), None
         halved = TorchBackend(kept.build_net(trust=options.trust), work.info, device=torch.device("cpu"))
         parity = compare(halved, work.reference, images.compared)
     else:
-        kept, onnx = work.checkpoint, work.onnx
+        kept, onnx = work.checkpoint, work.onnx(info)
         parity = work.compare(onnx, backend="onnxruntime")
     model = DepthModel(work.reference)
     samples = [model.predict(image) for image in images.compared[:: max(1, len(images.compared) // 3)][:3]]
     results = _read_results(work.checkpoint)
-    info, folder = replace(work.info, processing=True), work.folder / name
+    folder = work.folder / name
     card = model_card(
         work.checkpoint, info, name=name, results=results, parity=str(parity), half=options.half,
         samples=len(samples), origin=images.origin, trust=options.trust,

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from hudepth import __version__
 from hudepth.base.files import written_whole
+from hudepth.inference.backends import DepthPipeline
 from hudepth.inference.model_info import KEY, ModelInfo
-from hudepth.inference.pipeline import DepthPipeline
 from hudepth.inference.runtimes import package
 
 OPSET = 18
@@ -38,18 +38,16 @@ def describe(info: ModelInfo) -> dict[str, str]:
     """Return the metadata of a file: hudepth's own description, and one for people and other programs."""
     height, width = info.size
     if info.processing:
-        takes = f"{INPUT}: uint8 [batch, {height}, {width}, 3], RGB, the whole image resized to this size"
-        gives = f"{OUTPUTS[True]}: float32 [batch, {height}, {width}], distance along the optical axis in metres"
+        image = f"uint8 [batch, {height}, {width}, 3], RGB, the whole image resized to this size"
+        depth = f"float32 [batch, {height}, {width}], distance along the optical axis in metres"
     else:
-        takes = (
-            f"{INPUT}: float32 [batch, 3, {height}, {width}], RGB in [0, 1] less (0.485, 0.456, 0.406), over "
-            "(0.229, 0.224, 0.225)"
-        )
-        gives = f"{OUTPUTS[False]}: float32 [batch, 1, {height}, {width}], depth / {info.max_depth_m:g} m"
+        mean_std = "less (0.485, 0.456, 0.406), over (0.229, 0.224, 0.225)"
+        image = f"float32 [batch, 3, {height}, {width}], RGB in [0, 1] {mean_std}"
+        depth = f"float32 [batch, 1, {height}, {width}], depth / {info.max_depth_m:g} m"
     return {
         KEY: info.to_json(),
-        "input": takes,
-        "output": gives,
+        "input": f"{INPUT}: {image}",
+        "output": f"{OUTPUTS[info.processing]}: {depth}",
         "max_depth_m": f"{info.max_depth_m:g}",
         "trained_on": json.dumps(info.trained_on, sort_keys=True),
         "producer": f"hudepth {__version__}",
@@ -86,32 +84,16 @@ def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
 
 
 def export_program(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
-    """Write a ``torch.export`` program for any batch size.
-
-    Args:
-        net: normalised image to unit depth.
-        path: ``.pt2``, written whole or not at all.
-        info: its description.
-    """
+    """Write a ``torch.export`` program (``.pt2``) for any batch size, whole or not at all; see :func:`export_onnx`."""
     graph, image = export_graph(net, info)
-    with _quiet(), torch.no_grad():
+    with _quiet(), torch.no_grad(), written_whole(path) as part:
         program = torch.export.export(graph, (image,), dynamic_shapes=({0: torch.export.Dim("batch", min=1)},))
-        with written_whole(path) as part:
-            renamed = part.with_suffix(".pt2")  # torch requires this ending
-            try:
-                torch.export.save(program, renamed, extra_files={f"{KEY}.json": info.to_json()})
-                renamed.replace(part)
-            finally:
-                renamed.unlink(missing_ok=True)
+        with part.open("wb") as file:
+            torch.export.save(program, file, extra_files={f"{KEY}.json": info.to_json()})
 
 
 def export_openvino(onnx: Path, path: Path, *, info: ModelInfo) -> None:
-    """Convert an ONNX file to OpenVINO's format, with float32 weights.
-
-    Args:
-        onnx: a file that :func:`export_onnx` wrote.
-        path: ``.xml``; the weights go into a ``.bin`` next to it.
-        info: its description.
+    """Convert an ONNX file to OpenVINO's format (``.xml``, ``.bin``), with float32 weights.
 
     Raises:
         ConfigError: if ``openvino`` is not installed.
@@ -133,12 +115,12 @@ def _quiet() -> Iterator[None]:
     """Hide the exporter's remarks about optional packages."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in loggers]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            for logger in loggers:
-                logger.setLevel(logging.ERROR)
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             yield
-        finally:
-            for logger, level in zip(loggers, levels, strict=True):
-                logger.setLevel(level)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

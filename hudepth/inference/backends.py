@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.normalise import NormaliseBytes
 from hudepth.inference.model_info import KEY, ModelInfo
-from hudepth.inference.pipeline import DepthPipeline
 from hudepth.inference.runtimes import onnx_session, openvino_model
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint
@@ -43,6 +42,24 @@ class Backend(Protocol):
         ...
 
 
+class DepthPipeline(nn.Module):
+    """The network with its pre- and post-processing, RGB bytes to metres; also the graph that is exported.
+
+    Args:
+        net: normalised image to unit depth.
+        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
+    """
+
+    def __init__(self, net: nn.Module, *, max_depth_m: float) -> None:
+        super().__init__()
+        self.normalise, self.net, self.max_depth_m = NormaliseBytes(), net, max_depth_m
+
+    def forward(self, image: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b h w"]:
+        """Predict depth [m], never below 0."""
+        depth: Tensor = self.net(self.normalise(image))[:, 0] * self.max_depth_m
+        return depth.clamp(min=0)
+
+
 class TorchBackend:
     """A network in PyTorch.
 
@@ -61,7 +78,7 @@ class TorchBackend:
     def __call__(self, rgb: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
         """Return depth [m] of RGB images at the model's size."""
         with torch.inference_mode():
-            depth: torch.Tensor = self.pipeline(torch.from_numpy(rgb).to(self.device))
+            depth: Tensor = self.pipeline(torch.from_numpy(rgb).to(self.device))
             return np.asarray(depth.cpu().numpy())
 
     @classmethod

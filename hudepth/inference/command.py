@@ -79,7 +79,7 @@ def predict(cfg: DictConfig) -> None:
     if output.resolve() in {item.path.parent.resolve() for item in (*inputs.images, *inputs.videos)}:
         raise ConfigError(f"output: '{output}' is the folder of the input. Pass another, output=<folder>.")
     model = load_model(options)
-    _log_model(model)
+    log.info("model: %s; %s, fit=%s", model.info, model.backend.name, model.fit)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
     job = Job(model, output, Style(options.scale_m or (0.0, model.info.max_depth_m), camera), options)
     start = time.monotonic()
@@ -101,15 +101,6 @@ def predict(cfg: DictConfig) -> None:
         raise DataError(
             f"{failed} of {failed + job.tally.done} could not be predicted, see above; the rest is in '{output}'."
         )
-
-
-def _log_model(model: DepthModel) -> None:
-    info = model.info
-    log.info(
-        "model: %s of %s parameters, trained on %s for %d epochs; %d x %d, up to %g m; %s, fit=%s",
-        info.name, f"{info.parameters:,}", info.trained_on.get("source", "unknown data"), info.epoch,
-        *info.size, info.max_depth_m, model.backend.name, model.fit,
-    )  # fmt: skip
 
 
 def _predict_images(job: Job, items: list[Item]) -> None:

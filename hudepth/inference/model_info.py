@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any
 
-from hudepth.base.errors import CheckpointError
+from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.options import Range, parse
 from hudepth.runs.checkpoint import Checkpoint
 
 VERSION = 1
@@ -25,19 +26,24 @@ class ModelInfo:
 
     name: str
     """Class of the network, for example ``HybridUNet``."""
-    size: tuple[int, int]
+    size: Annotated[tuple[int, int], Range(1, MAX_SIDE)]
     """(height, width) of the images the network takes."""
-    max_depth_m: float
+    max_depth_m: Annotated[float, Range(0, 1e6, above=True)]
     """Maximum depth [m]; the network predicts depth / max_depth_m."""
     parameters: int
     epoch: int
     """Finished epochs of training."""
     trained_on: dict[str, Any] = field(default_factory=dict)
     """Source, fingerprint, encoding and split of the training data."""
-    aspect: float = USUAL_ASPECT
+    aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT
     """Width over height of the training images before they were resized."""
     processing: bool = True
     """Whether an exported graph maps RGB bytes to metres; otherwise normalised images to unit depth."""
+
+    def __str__(self) -> str:
+        source, size = self.trained_on.get("source") or "unknown data", f"{self.size[0]} x {self.size[1]}"
+        network = f"{self.name} of {self.parameters:,} parameters"
+        return f"{network}, trained on {source} for {self.epoch} epochs; {size}, up to {self.max_depth_m:g} m"
 
     def to_json(self) -> str:
         """Return the description as JSON."""
@@ -54,24 +60,12 @@ class ModelInfo:
             content = json.loads(text)
             if not isinstance(content, Mapping) or content.get("version") != VERSION:
                 raise ValueError("unknown version")
-            height, width = (int(side) for side in content["size"])
-            depth, aspect = float(content["max_depth_m"]), float(content["aspect"])
-            if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and 0 < depth < 1e6 and 0.01 < aspect < 100):
-                raise ValueError("values out of range")
-            return cls(
-                name=str(content["name"])[:100],
-                size=(height, width),
-                max_depth_m=depth,
-                parameters=int(content["parameters"]),
-                epoch=int(content["epoch"]),
-                trained_on=dict(content["trained_on"]),
-                aspect=aspect,
-                processing=bool(content["processing"]),
-            )
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            info = parse(cls, content)
+        except (ValueError, RecursionError, ConfigError) as error:
             raise CheckpointError(
                 f"{where}: its model description cannot be read ({error}). Export it again with hudepth-export."
             ) from error
+        return replace(info, name=info.name[:100])
 
     @classmethod
     def of_checkpoint(

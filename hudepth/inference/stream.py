@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -33,38 +32,29 @@ class Tally:
     """Remarks on images that were predicted."""
 
 
+@dataclass
 class Stream(Generic[Key]):
     """Predicts images one after another, in order, a lot at a time.
 
     A network that uses every core of a CPU is slowed down by any other work: its threads wait for each other, so one
     delayed thread delays all. There the steps alternate: a lot is decoded, then predicted, then written. With a GPU or
     spare cores (``overlap``), one lot is written and the next one decoded while another is predicted.
-
-    Args:
-        model: what predicts.
-        write: called in a thread with each image's key and depth.
-        tally: where to count results.
-        batch_size: images that go through the network together.
-        workers: threads that decode and write; one keeps the order.
-        overlap: whether they work while the network computes.
-        smoothing: of consecutive frames: the weight of the previous depth, from 0 (none) to less than 1.
     """
 
-    def __init__(
-        self,
-        model: DepthModel,
-        write: Callable[[Key, DepthMap], None],
-        *,
-        tally: Tally,
-        batch_size: int = 1,
-        workers: int = 2,
-        overlap: bool = False,
-        smoothing: float = 0.0,
-    ) -> None:
-        self._model, self._write = model, write
-        self._batch_size, self._workers, self._overlap, self._smoothing = batch_size, workers, overlap, smoothing
-        self._previous: Float[np.ndarray, "h w"] | None = None
-        self.tally = tally
+    model: DepthModel
+    write: Callable[[Key, DepthMap], None]
+    """Called in a thread with each image's key and depth."""
+    tally: Tally = field(kw_only=True)
+    """Where to count results."""
+    batch_size: int = field(default=1, kw_only=True)
+    """Images that go through the network together."""
+    workers: int = field(default=2, kw_only=True)
+    """Threads that decode and write; one keeps the order."""
+    overlap: bool = field(default=False, kw_only=True)
+    """Whether they work while the network computes."""
+    smoothing: float = field(default=0.0, kw_only=True)
+    """Of consecutive frames: the weight of the previous depth, from 0 (none) to less than 1."""
+    _previous: Float[np.ndarray, "h w"] | None = field(default=None, init=False)
 
     def run(self, pictures: Iterable[tuple[Key, Picture]]) -> Iterator[Key]:
         """Predict and write; yield each key once its image has been predicted or found unreadable.
@@ -76,8 +66,8 @@ class Stream(Generic[Key]):
         Raises:
             OSError: if a result cannot be written; earlier results are kept.
         """
-        with ThreadPoolExecutor(self._workers) as pool:
-            writing: deque[Future[None]] = deque()
+        with ThreadPoolExecutor(self.workers) as pool:
+            writing: list[Future[None]] = []
             try:
                 for lot in self._lots(pool, pictures):
                     jobs = []
@@ -86,8 +76,8 @@ class Stream(Generic[Key]):
                             jobs.append(job)
                         yield key
                     _wait(writing)  # for the previous lot
-                    writing.extend(pool.submit(job) for job in jobs)
-                    if not self._overlap:
+                    writing = [pool.submit(job) for job in jobs]
+                    if not self.overlap:
                         _wait(writing)
                 _wait(writing)
             finally:
@@ -98,8 +88,7 @@ class Stream(Generic[Key]):
         self, pool: ThreadPoolExecutor, pictures: Iterable[tuple[Key, Picture]]
     ) -> Iterator[list[tuple[Key, Prepared | DataError]]]:
         """Yield lots of decoded images; with ``overlap`` the next one is decoded meanwhile."""
-        left = iter(pictures)
-        size = max(LOT * self._workers, self._batch_size)
+        left, size = iter(pictures), max(LOT * self.workers, self.batch_size)
 
         def begin() -> list[tuple[Key, Future[Prepared | DataError]]]:
             return [(key, pool.submit(self._prepare, picture)) for key, picture in islice(left, size)]
@@ -107,16 +96,15 @@ class Stream(Generic[Key]):
         coming = begin()
         while coming:
             lot = [(key, future.result()) for key, future in coming]
-            if self._overlap:
+            if self.overlap:
                 coming = begin()
-                yield lot
-            else:
-                yield lot
+            yield lot
+            if not self.overlap:
                 coming = begin()
 
     def _prepare(self, picture: Picture) -> Prepared | DataError:
         try:
-            return self._model.prepare(picture)
+            return self.model.prepare(picture)
         except DataError as error:
             return error
 
@@ -129,9 +117,9 @@ class Stream(Generic[Key]):
                 yield key, None
             else:
                 good.append((key, prepared))
-        for at in range(0, len(good), self._batch_size):
-            batch = good[at : at + self._batch_size]
-            depths = self._model.run([prepared for _, prepared in batch])
+        for at in range(0, len(good), self.batch_size):
+            batch = good[at : at + self.batch_size]
+            depths = self.model.run([prepared for _, prepared in batch])
             for (key, prepared), depth in zip(batch, depths, strict=True):
                 self.tally.done += 1
                 if prepared.photo.notes:
@@ -139,15 +127,15 @@ class Stream(Generic[Key]):
                 yield key, partial(self._finish, key, prepared, self._smooth(depth))
 
     def _smooth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        if self._smoothing and self._previous is not None:
-            depth = (self._smoothing * self._previous + (1 - self._smoothing) * depth).astype(np.float32)
+        if self.smoothing and self._previous is not None:
+            depth = (self.smoothing * self._previous + (1 - self.smoothing) * depth).astype(np.float32)
         self._previous = depth
         return depth
 
     def _finish(self, key: Key, prepared: Prepared, depth: Float[np.ndarray, "h w"]) -> None:
-        self._write(key, self._model.finish(prepared, depth))
+        self.write(key, self.model.finish(prepared, depth))
 
 
-def _wait(futures: deque[Future[None]]) -> None:
-    while futures:
-        futures.popleft().result()
+def _wait(futures: list[Future[None]]) -> None:
+    for future in futures:
+        future.result()

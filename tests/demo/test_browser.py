@@ -80,7 +80,7 @@ def page(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        found = re.fullmatch(r"model: TinyUNet, .*; open (http://127\.0\.0\.1:\d+) \(Ctrl-C stops\)\n", line)
+        found = re.fullmatch(r"model: TinyUNet of .*; open (http://127\.0\.0\.1:\d+) \(Ctrl-C stops\)\n", line)
         assert found, line + process.stdout.read()
         yield Page(process, found[1], folder / "temporary", folder / "calls")
     finally:
