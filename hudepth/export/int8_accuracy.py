@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from hudepth.base.normalise import denormalise_image
-from hudepth.base.tables import Table
+from hudepth.base.tables import Table, stdout
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.lineage import note_scored
 from hudepth.evaluation.protocols import build_protocols
@@ -86,10 +86,8 @@ def measure_int8(
 
 
 def _print(protocol: str, rows: Mapping[str, Any], *, images: str) -> None:
-    table = Table(
-        ["", FLOAT, INT8, "change"],
-        title=f"int8: {protocol} protocol, {images}; change: int8 minus float32, 95 % interval over scenes",
-    )
+    stdout().print(f"int8: {protocol} protocol, {images}; change: int8 minus float32, 95 % interval over scenes")
+    table = Table(["", FLOAT, INT8, "change"])
     for key, row in rows.items():
         info, (low, high) = metric_info(key), row["interval"]
         digits = info.decimals + 1  # changes are small
