@@ -1,10 +1,11 @@
-"""Training losses: all take (pred, target, image, valid) and return :class:`hudepth.base.types.LossTerms`."""
+"""Training losses; :class:`Loss` describes how they are called."""
 
 from __future__ import annotations
 
 from hudepth.losses.badcl import BADCL
+from hudepth.losses.base import Loss, SingleTermLoss
 from hudepth.losses.baselines import L1, L2, BerHu, SILog
 from hudepth.losses.gradients import GradientMatching
 from hudepth.losses.mixture import Mixture
 
-__all__ = ["BADCL", "L1", "L2", "BerHu", "GradientMatching", "Mixture", "SILog"]
+__all__ = ["BADCL", "L1", "L2", "BerHu", "GradientMatching", "Loss", "Mixture", "SILog", "SingleTermLoss"]

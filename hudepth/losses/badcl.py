@@ -5,24 +5,23 @@
     L_scaling    = 1/N sum_i s |D^(i) - D(i)|           s = sum_i D(i) / (sum_i D^(i) + eps)
     L_BADCL      = 3.0 L_boundary + 1.2 L_smoothness + 1.0 L_scaling
 
-D is the truth, D^ the prediction, I the image. N counts the valid pixels of the batch where the truth is
-compared, and all pixels in L_smoothness, which concerns the prediction only. What the paper leaves open is an
-option of :class:`BADCL`.
+D is the ground truth, D^ the prediction, I the image. N counts the valid pixels of the batch, and all pixels in
+L_smoothness, which concerns the prediction only. What the paper leaves open is an option of :class:`BADCL`.
 """
 
 from __future__ import annotations
 
-import math
 from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from hudepth.base.errors import ConfigError, did_you_mean
-from hudepth.base.masked import full_precision, masked_mean, masked_sum
+from hudepth.base.masked import masked_mean, masked_sum
 from hudepth.base.normalise import denormalise_image
-from hudepth.base.types import LossTerms
+from hudepth.base.options import Choice, Range, convert
+from hudepth.losses.base import Loss, check_weights, difference
 
 CHOICES = {
     "boundary_sign": ("plus", "minus"),
@@ -41,10 +40,7 @@ BT601_LUMA = (0.299, 0.587, 0.114)
 def check_choices(**options: str) -> None:
     """Raise :class:`ConfigError` if an option's value is not among its :data:`CHOICES`."""
     for option, value in options.items():
-        if value not in CHOICES[option]:
-            known = " or ".join(f"'{choice}'" for choice in CHOICES[option])
-            hint = did_you_mean(str(value), CHOICES[option])
-            raise ConfigError(f"loss.{option}: no choice '{value}'. Use {known}.{hint}")
+        convert(f"loss.{option}", value, Annotated[str, Choice(CHOICES[option])], default=CHOICES[option][0])
 
 
 def forward_difference(x: Float[Tensor, "b c h w"], *, dim: int) -> Float[Tensor, "b c h w"]:
@@ -83,7 +79,7 @@ def boundary_loss(
     valid: Bool[Tensor, "b 1 h w"],
 ) -> Float[Tensor, ""]:
     """Mean over valid pixels of the absolute error times its :func:`boundary_weight` (equation 1)."""
-    return masked_mean(weight * _difference(pred, target, valid).abs(), valid)
+    return masked_mean(weight * difference(pred, target, valid).abs(), valid)
 
 
 def smoothness_loss(
@@ -91,7 +87,7 @@ def smoothness_loss(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of neighbouring predictions, damped where the image has edges (equation 3).
 
-    It concerns the prediction only and is averaged over all pixels, so it acts also where the truth is
+    It concerns the prediction only and is averaged over all pixels, so it also acts where the ground truth is
     unmeasured. Over several channels the magnitudes of the image's differences are averaged.
     """
     weight_x = torch.exp(-image_dx.abs().mean(dim=1, keepdim=True))
@@ -116,7 +112,7 @@ def scaling_factor(
     Args:
         pred: unit depth.
         target: unit depth; ignored where not valid.
-        valid: True where the truth is measured.
+        valid: True where the ground truth is measured.
         per: s for each "image" (n = b), or one for the "batch" (n = 1).
         eps: added to the sum of predictions.
 
@@ -143,7 +139,7 @@ def scaling_loss(
     Args:
         pred: unit depth.
         target: unit depth; ignored where not valid.
-        valid: True where the truth is measured.
+        valid: True where the ground truth is measured.
         per: s for each "image", or one for the "batch".
         mode: "weight": s |D^ - D|, as printed; "align": |s D^ - D|, the usual alignment of scale.
         gradient: "flow" through s, or "stop" there.
@@ -157,11 +153,11 @@ def scaling_loss(
     if gradient == "stop":
         factor = factor.detach()
     if mode == "weight":
-        return masked_mean(factor * _difference(pred, target, valid).abs(), valid)
-    return masked_mean(_difference(factor * pred, target, valid).abs(), valid)
+        return masked_mean(factor * difference(pred, target, valid).abs(), valid)
+    return masked_mean(difference(factor * pred, target, valid).abs(), valid)
 
 
-class BADCL(nn.Module):
+class BADCL(Loss):
     """The paper's loss: boundary, smoothness and scaling terms, weighted and summed (section 3.3).
 
     Args:
@@ -196,9 +192,8 @@ class BADCL(nn.Module):
     ) -> None:
         super().__init__()
         self.weights = {"boundary": boundary, "smoothness": smoothness, "scaling": scaling}
-        _check_weights(self.weights)
-        if not eps >= 1e-12:
-            raise ConfigError(f"loss.eps: {eps} is too small for float32. Use at least 1e-12.")
+        check_weights("loss", self.weights)
+        convert("loss.eps", eps, Annotated[float, Range(1e-12)], default=1e-8)  # smaller ones vanish in float32
         check_choices(boundary_sign=boundary_sign, image_space=image_space, image_channels=image_channels)
         check_choices(scale_per=scale_per, scale_mode=scale_mode, scale_gradient=scale_gradient)
         self.boundary_sign = boundary_sign
@@ -206,29 +201,8 @@ class BADCL(nn.Module):
         self.image_channels = image_channels
         self.scaling_loss = partial(scaling_loss, per=scale_per, mode=scale_mode, gradient=scale_gradient, eps=eps)
 
-    def forward(
-        self,
-        pred: Float[Tensor, "b 1 h w"],
-        target: Float[Tensor, "b 1 h w"],
-        image: Float[Tensor, "b 3 h w"],
-        valid: Bool[Tensor, "b 1 h w"],
-    ) -> LossTerms:
-        """Return the weighted sum and each raw term, in float32 (float64 for float64) whatever autocast says.
-
-        Value and gradient are finite for any prediction and truth in [0, 1], also where nothing is valid.
-
-        Args:
-            pred: unit depth in [0, 1].
-            target: unit depth in [0, 1]; ignored where not valid.
-            image: RGB, ImageNet-normalised. It only weights; no gradient reaches it.
-            valid: True where the truth is measured.
-        """
-        with torch.autocast(pred.device.type, enabled=False):
-            terms = self._terms(full_precision(pred), full_precision(target), full_precision(image.detach()), valid)
-            total = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
-        return LossTerms(total, terms)
-
-    def _terms(self, pred: Tensor, target: Tensor, image: Tensor, valid: Tensor) -> dict[str, Tensor]:
+    def terms(self, pred: Tensor, target: Tensor, image: Tensor, valid: Tensor) -> dict[str, Tensor]:
+        """Return the terms whose weight is not 0; finite for any prediction and target in [0, 1]."""
         terms = {}
         if self.weights["boundary"] or self.weights["smoothness"]:
             guide = denormalise_image(image) if self.image_space == "unit" else image
@@ -242,18 +216,3 @@ class BADCL(nn.Module):
         if self.weights["scaling"]:
             terms["scaling"] = self.scaling_loss(pred, target, valid)
         return terms
-
-
-def _difference(pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
-    # masked before any other arithmetic, which an invalid NaN must not enter
-    return torch.where(valid, pred - target, 0.0)
-
-
-def _check_weights(weights: dict[str, float]) -> None:
-    for name, weight in weights.items():
-        if not (math.isfinite(weight) and weight >= 0):
-            raise ConfigError(
-                f"loss.{name}: weight {weight}. Use a finite number of at least 0 (0 leaves the term out)."
-            )
-    if not any(weights.values()):
-        raise ConfigError(f"loss: {', '.join(weights)} all have weight 0. Give at least one a positive weight.")

@@ -1,38 +1,36 @@
-"""Losses of the field to compare BADCL with: L1, L2, BerHu (Laina et al. 2016), SILog (Eigen et al. 2014).
+"""Standard losses to compare BADCL with: L1, L2, BerHu (Laina et al. 2016), SILog (Eigen et al. 2014).
 
 All are means over the valid pixels of the batch, and 0 where nothing is valid.
 """
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from hudepth.base.errors import ConfigError
-from hudepth.base.masked import full_precision, masked_mean
-from hudepth.base.types import LossTerms
+from hudepth.base.masked import masked_mean
+from hudepth.base.options import Range, convert
+from hudepth.losses.base import Positive, SingleTermLoss, difference
 
 MIN_UNIT_DEPTH = 1e-3
-"""Depths below this count as this under a logarithm: 1 cm where the unit is 10 m."""
+"""Depths below this count as this under a logarithm: 1 cm at a maximum depth of 10 m."""
 
 
 def l1_loss(
     pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
     """Mean absolute error."""
-    return masked_mean(torch.where(valid, pred - target, 0.0).abs(), valid)
+    return masked_mean(difference(pred, target, valid).abs(), valid)
 
 
 def l2_loss(
     pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
     """Mean squared error."""
-    return masked_mean(torch.where(valid, pred - target, 0.0).square(), valid)
+    return masked_mean(difference(pred, target, valid).square(), valid)
 
 
 def berhu_loss(
@@ -46,7 +44,7 @@ def berhu_loss(
 
     c = ``threshold`` * the largest |e| among the valid pixels of the batch; no gradient flows through it.
     """
-    error = torch.where(valid, pred - target, 0.0).abs()
+    error = difference(pred, target, valid).abs()
     # tiny: without any error c is 0, and the branch not taken must not divide by it
     c = (threshold * error.detach().amax()).clamp_min(torch.finfo(error.dtype).tiny)
     return masked_mean(torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)), valid)
@@ -84,36 +82,6 @@ def silog_loss(
     return factor * torch.where(positive, torch.where(positive, radicand, 1.0).sqrt(), 0.0)
 
 
-class SingleTermLoss(nn.Module, ABC):
-    """A loss of one term, called like :class:`hudepth.losses.BADCL`."""
-
-    name: ClassVar[str]
-    """What its term is called."""
-
-    def forward(
-        self,
-        pred: Float[Tensor, "b 1 h w"],
-        target: Float[Tensor, "b 1 h w"],
-        image: Float[Tensor, "b 3 h w"],
-        valid: Bool[Tensor, "b 1 h w"],
-    ) -> LossTerms:
-        """Return the loss, in float32 (float64 for float64) whatever autocast says.
-
-        Args:
-            pred: unit depth in [0, 1].
-            target: unit depth in [0, 1]; ignored where not valid.
-            image: not used.
-            valid: True where the truth is measured.
-        """
-        with torch.autocast(pred.device.type, enabled=False):
-            value = self.value(full_precision(pred), full_precision(target), valid)
-        return LossTerms(value, {self.name: value})
-
-    @abstractmethod
-    def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
-        """Return the loss of full-precision inputs."""
-
-
 class L1(SingleTermLoss):
     """:func:`l1_loss` as a module."""
 
@@ -148,9 +116,7 @@ class BerHu(SingleTermLoss):
 
     def __init__(self, *, threshold: float = 0.2) -> None:
         super().__init__()
-        if not 0 < threshold <= 1:
-            raise ConfigError(f"loss.threshold: {threshold} is not in (0, 1]. The usual value is 0.2.")
-        self.threshold = threshold
+        self.threshold = convert("loss.threshold", threshold, Annotated[float, Range(0, 1, above=True)], default=0.2)
 
     def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
         """Return :func:`berhu_loss`."""
@@ -172,12 +138,10 @@ class SILog(SingleTermLoss):
 
     def __init__(self, *, variance_focus: float = 0.85, factor: float = 10.0) -> None:
         super().__init__()
-        if not 0 <= variance_focus <= 1:
-            raise ConfigError(f"loss.variance_focus: {variance_focus} is not in [0, 1]. The usual value is 0.85.")
-        if not (math.isfinite(factor) and factor > 0):
-            raise ConfigError(f"loss.factor: {factor} is not positive. The usual value is 10.")
-        self.variance_focus = variance_focus
-        self.factor = factor
+        self.variance_focus = convert(
+            "loss.variance_focus", variance_focus, Annotated[float, Range(0, 1)], default=0.85
+        )
+        self.factor = convert("loss.factor", factor, Positive, default=10.0)
 
     def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
         """Return :func:`silog_loss`."""

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.masked import full_precision, masked_mean, masked_sum
+from hudepth.base.options import Choice, convert
+from hudepth.losses.base import Positive
 from hudepth.losses.baselines import MIN_UNIT_DEPTH, log_difference
 
 KINDS = ("metric", "affine_depth", "affine_inverse")
-"""What a teacher's numbers are: metres; depth, or inverse depth (disparity), up to scale and shift."""
+"""Values a teacher may have: metres; depth, or inverse depth (disparity), up to scale and shift."""
 
 
 def normalised_by_mean(
@@ -36,7 +37,7 @@ def affine_invariant_loss(
 
 
 class Distillation(nn.Module):
-    """The distance from a teacher's depths, times a weight; it is added to the loss of the truth.
+    """The distance from a teacher's depths, times a weight; added to the loss of the ground truth.
 
     Args:
         kind: one of :data:`KINDS`. ``metric`` compares logarithms of depth.
@@ -48,20 +49,15 @@ class Distillation(nn.Module):
 
     def __init__(self, *, kind: str = "metric", weight: float = 1.0) -> None:
         super().__init__()
-        if kind not in KINDS:
-            raise ConfigError(f"distill.kind: no '{kind}'.{did_you_mean(kind, KINDS)} Pass one of {', '.join(KINDS)}.")
-        if not (math.isfinite(weight) and weight > 0):
-            raise ConfigError(
-                f"distill.weight: {weight} is not positive. Pass distill=none to learn without a teacher."
-            )
-        self.kind, self.weight = kind, weight
+        self.kind = convert("distill.kind", kind, Annotated[str, Choice(KINDS)])
+        self.weight = convert("distill.weight", weight, Positive, default=1.0)
 
     def forward(self, pred: Float[Tensor, "b 1 h w"], teacher: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
         """Return the distance, before its weight.
 
         Args:
             pred: unit depth.
-            teacher: unit depth if the kind is ``metric``, else what the teacher said; 0 where it said nothing.
+            teacher: unit depth if the kind is ``metric``, else the teacher's values; 0 where it has none.
         """
         valid = teacher > 0
         with torch.autocast(pred.device.type, enabled=False):

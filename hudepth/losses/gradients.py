@@ -5,13 +5,16 @@ R = ln D^ - ln D        L = sum over scales k of mean(|R_x| + |R_y|) at every 2^
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hudepth.base.errors import ConfigError
 from hudepth.base.masked import masked_mean
-from hudepth.losses.baselines import SingleTermLoss, log_difference
+from hudepth.base.options import Range, convert
+from hudepth.losses.base import SingleTermLoss
+from hudepth.losses.baselines import log_difference
 
 
 def gradient_matching_loss(
@@ -21,14 +24,14 @@ def gradient_matching_loss(
     *,
     scales: int = 4,
 ) -> Float[Tensor, ""]:
-    """Mean over valid neighbours of how much the log ratio of prediction and truth changes, summed over scales.
+    """Mean over valid neighbours of how much the log ratio of prediction and ground truth changes, summed over scales.
 
-    It is blind to one scale factor for an image, and sees an edge that is missing, blurred or made up.
+    It ignores a scale factor per image, and penalises edges that are missing, blurred or spurious.
 
     Args:
         pred: unit depth.
         target: unit depth; ignored where not valid.
-        valid: True where the truth is measured; a difference counts where both its pixels are.
+        valid: True where the ground truth is measured; a difference counts where both its pixels are.
         scales: 1 compares neighbours, 2 also every second pixel with the next second pixel, and so on.
     """
     ratio = log_difference(pred, target, valid)
@@ -58,9 +61,7 @@ class GradientMatching(SingleTermLoss):
 
     def __init__(self, *, scales: int = 4) -> None:
         super().__init__()
-        if scales < 1:
-            raise ConfigError(f"loss.scales: {scales} is less than 1. The usual value is 4.")
-        self.scales = scales
+        self.scales = convert("loss.scales", scales, Annotated[int, Range(1)], default=4)
 
     def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
         """Return :func:`gradient_matching_loss`."""

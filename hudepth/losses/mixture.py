@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 
@@ -12,10 +11,11 @@ from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.types import LossTerms
+from hudepth.losses.base import check_weights
 
 
 class Mixture(nn.Module):
-    """Several losses, each with a weight; their terms are logged side by side.
+    """Several losses, each with a weight; the terms of all are logged.
 
     Args:
         losses: by name.
@@ -33,11 +33,8 @@ class Mixture(nn.Module):
         for name in losses:
             if name not in weights:
                 raise ConfigError(f"loss.weights: none for '{name}'. Pass loss.weights.{name}=1, or 0 to leave it out.")
-            if not (math.isfinite(weights[name]) and weights[name] >= 0):
-                raise ConfigError(f"loss.weights.{name}: {weights[name]} is not a number of at least 0.")
+        check_weights("loss.weights", weights)
         self.weights = {name: float(weight) for name, weight in weights.items() if weight}
-        if not self.weights:
-            raise ConfigError(f"loss.weights: {', '.join(losses)} all have weight 0. Give one a positive weight.")
         self.losses = nn.ModuleDict({name: losses[name] for name in self.weights})
 
     def forward(
@@ -47,23 +44,14 @@ class Mixture(nn.Module):
         image: Float[Tensor, "b 3 h w"],
         valid: Bool[Tensor, "b 1 h w"],
     ) -> LossTerms:
-        """Return the weighted sum of the losses' totals, and all their terms.
-
-        Args:
-            pred: unit depth in [0, 1].
-            target: unit depth in [0, 1]; ignored where not valid.
-            image: RGB, ImageNet-normalised.
-            valid: True where the truth is measured.
-        """
+        """Return the weighted sum of the losses' totals, and all their terms; arguments as in :class:`Loss`."""
         parts = {name: loss(pred, target, image, valid) for name, loss in self.losses.items()}
         total = torch.stack([self.weights[name] * part.total for name, part in parts.items()]).sum()
-        # one that two losses call the same is also called by its loss's name
+        # a term name that two losses share gets the loss's name in front
         names = Counter(term for part in parts.values() for term in part.terms)
-        return LossTerms(
-            total,
-            {
-                term if names[term] == 1 else f"{name}_{term}": value
-                for name, part in parts.items()
-                for term, value in part.terms.items()
-            },
-        )
+        terms = {
+            term if names[term] == 1 else f"{name}_{term}": value
+            for name, part in parts.items()
+            for term, value in part.terms.items()
+        }
+        return LossTerms(total, terms)
