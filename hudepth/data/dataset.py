@@ -22,7 +22,7 @@ class StoreDataset(Dataset[RawBatch]):
     Args:
         store: where the pairs lie.
         indices: which of them, as positions in the store.
-        native: also read the truth at its native resolution.
+        native: also read the ground truth at its native resolution.
         teacher: also read a teacher's depths.
     """
 
@@ -82,19 +82,19 @@ class ShardSampler(Sampler[int]):
 class BlockShuffle(Sampler[int]):
     """Shuffles training pairs so that they are read from the disk in large pieces.
 
-    A store that is larger than memory is read from the disk anew each epoch, and reads far apart are slow. So blocks of
-    neighbouring pairs are shuffled, then the pairs within each group of a few blocks. The order depends on seed and
-    epoch alone. Each process gets every ``world_size``-th pair; where that does not divide, the first ones are seen
-    twice, so that all take as many steps.
+    A store larger than memory is read from the disk each epoch, and scattered reads are slow. So blocks of neighbouring
+    pairs are shuffled, then the pairs within each group of a few blocks. The order depends only on seed and epoch. Each
+    process gets every ``world_size``-th pair; if that does not divide evenly, the first pairs are repeated, so that
+    all processes take equally many steps.
 
     Args:
-        rows: where each pair lies in the store.
-        block: neighbouring pairs that are read together.
+        rows: position of each pair in the store.
+        block: number of neighbouring pairs that are read together.
         seed: of the order.
         rank: of this process.
         world_size: number of processes.
-        group: blocks whose pairs are mixed; that many lie in memory at once.
-        read_ahead: told (first row, last row) of each block before its pairs are asked for.
+        group: number of blocks whose pairs are mixed; they are in memory at once.
+        read_ahead: called with the first and last row of each block before its pairs are read.
     """
 
     def __init__(

@@ -88,13 +88,13 @@ def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, nativ
 def prepare_pairs(
     source: Source, records: Sequence[Record], size: tuple[int, int], *, native: bool, workers: int | None
 ) -> Generator[tuple[Record, PreparedPair | str], None, None]:
-    """Yield each record with its prepared pair, or with the line that says why there is none; in order."""
+    """Yield each record with its prepared pair, or with the line that states why it failed; in order."""
     workers = workers or usable_cores()
     if workers == 1 or len(records) < POOL_FROM:
         for record in records:
             yield record, _outcome(source, record, size, native=native)
         return
-    # spawn: a fork would copy the threads' locks of whatever the parent has loaded
+    # spawn: a fork would copy locks of the parent's threads
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker, (source, size, native)) as pool:
         waiting: deque[tuple[Record, Future[PreparedPair | str]]] = deque()
@@ -127,14 +127,14 @@ _worker: dict[str, Any] = {}
 
 
 def _start_worker(source: Source, size: tuple[int, int], native: bool) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers; they need not say so
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(1)  # one process per core already
     _worker.update(source=source, size=size, native=native)
 
 
 def _end_with_parent() -> None:
-    """A pool's processes outlive a parent that was killed: they wait for work that never comes."""
+    """End with the parent: a pool's processes would outlive one that was killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

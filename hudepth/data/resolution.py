@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.options import Range, Size, convert
 
 
 @dataclass(frozen=True)
 class Stage:
     """A part of a training."""
 
-    size: tuple[int, int]
+    size: Size
     """(height, width) of training images."""
-    until: float
+    until: Annotated[float, Range(0, 1, above=True, below=True)]
     """Share of the epochs after which it ends."""
 
 
@@ -25,36 +25,22 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
 
     Args:
         progressive: mappings of ``size`` and ``until``, in order.
-        size: (height, width) of the images in the store, which is that of what comes after the last stage.
+        size: (height, width) of the images in the store, which follows the last stage.
 
     Returns:
-        The stages whose images are smaller than the store's: a plan that was made for larger ones may be given, too.
+        The stages whose images are smaller than the store's; others are skipped, so one plan serves several sizes.
 
     Raises:
-        ConfigError: if it is no such list, or its shares do not rise within (0, 1).
+        ConfigError: if an entry is malformed, or the shares do not rise.
     """
-    stages: list[Stage] = []
-    before = 0.0
-    for number, entry in enumerate(progressive):
-        key = f"data.progressive[{number}]"
-        try:
-            height, width = (operator.index(side) for side in entry["size"])
-            stage = Stage((height, width), float(entry["until"]))
-        except (TypeError, ValueError, KeyError) as error:
+    stages: list[Stage] = convert("data.progressive", list(progressive), list[Stage])
+    for number, (before, stage) in enumerate(zip([0.0, *(stage.until for stage in stages)], stages, strict=False)):
+        if stage.until <= before:
             raise ConfigError(
-                f"{key}: {entry!r} is no stage. Pass data.progressive=[{{size:[112,112],until:0.5}}], for example."
-            ) from error
-        if not before < stage.until < 1:
-            raise ConfigError(
-                f"{key}.until: {stage.until:g} is not a share of the epochs between {before:g} and 1, where this "
-                "stage ends; shares rise from stage to stage, and the last part is at data.size."
+                f"data.progressive[{number}].until: {stage.until:g} is not between {before:g} and 1. Stages end at "
+                "rising shares of the epochs; the rest of the training is at data.size."
             )
-        before = stage.until
-        if min(height, width) < 1:
-            raise ConfigError(f"{key}.size: [{height},{width}] is no size of an image. Pass multiples of 16.")
-        if height <= size[0] and width <= size[1] and stage.size != size:
-            stages.append(stage)
-    return stages
+    return [s for s in stages if s.size[0] <= size[0] and s.size[1] <= size[1] and s.size != size]
 
 
 def size_at(stages: Sequence[Stage], epoch: int, *, epochs: int | None, final: tuple[int, int]) -> tuple[int, int]:
@@ -63,8 +49,8 @@ def size_at(stages: Sequence[Stage], epoch: int, *, epochs: int | None, final: t
     Args:
         stages: of the training.
         epoch: from 0.
-        epochs: of the training; None or -1, which is endless, has no shares: then only ``final`` is used.
-        final: what follows the last stage; the last epoch always has it.
+        epochs: of the training; if unlimited (None or -1), only ``final`` is used.
+        final: size after the last stage and in the last epoch.
     """
     if epochs is None or epochs < 1 or epoch >= epochs - 1:
         return final

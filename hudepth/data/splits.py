@@ -20,7 +20,7 @@ SUBSETS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Split:
-    """Positions in a store for each subset, and how they came about."""
+    """Positions in a store for each subset, and how they were chosen."""
 
     kind: str
     seed: int
@@ -35,7 +35,7 @@ class Split:
         return {"train": self.train, "val": self.val, "test": self.test}[subset]
 
     def summary(self) -> dict[str, Any]:
-        """What a metric file says of the split: kind, seed, fractions, counts and hash."""
+        """Return kind, seed, fractions, counts and hash, for metric files."""
         return {
             "kind": self.kind,
             "seed": self.seed,
@@ -89,7 +89,7 @@ def make_split(
 
 
 def check_split(kind: str, fractions: Sequence[float]) -> None:
-    """Accept what :func:`make_split` can work with.
+    """Check the arguments of :func:`make_split`.
 
     Raises:
         ConfigError: for an unknown kind or fractions that do not sum to 1.
@@ -180,7 +180,7 @@ def load_split(path: Path, records: Sequence[Record]) -> Split:
         kind, seed, sha256 = str(saved["kind"]), int(saved["seed"]), str(saved["sha256"])
         train, val, test = (float(share) for share in saved["fractions"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"'{path}' is no split.json ({type(error).__name__}: {error}).") from error
+        raise DataError(f"'{path}' is not a split.json ({type(error).__name__}: {error}).") from error
     if _hash(ids) != sha256:
         raise DataError(f"'{path}': its ids do not have the hash it states; it was edited. Restore it, or train again.")
     position = {record.id: i for i, record in enumerate(records)}

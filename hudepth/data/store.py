@@ -1,17 +1,17 @@
-"""The depth store: one HDF5 file that holds a prepared data set, whatever form it came in.
+"""The depth store: one HDF5 file that holds a prepared data set, whatever its original form.
 
 ======================  ===================  ==========================================================
 data set                dtype, shape         meaning
 ======================  ===================  ==========================================================
 image                   uint8 [n, h, w, 3]   RGB at training size
 depth_mm                uint16 [n, h, w]     millimetres at training size, 0 where unmeasured
-native/png              uint8 [bytes]        truth at native resolution: 16-bit PNGs [mm], one after another
+native/png              uint8 [bytes]        ground truth at native resolution: 16-bit PNGs [mm], one after another
 native/end              int64 [n]            where each of them ends
 records/<field>         [n]                  id, scene, frame, split, category of each pair
 ======================  ===================  ==========================================================
 
 The attribute ``info`` is a JSON object with the source's name and fingerprint, encoding, depth range and skipped files.
-A file without it was never finished; since stores are renamed into place only when whole, none should be seen.
+A file without it was never finished.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FORMAT = "hudepth-depth-store"
 VERSION = 1
 MM_PER_M = 1000.0
 MAX_STORED_M = np.iinfo(np.uint16).max / MM_PER_M
-"""65.535 m: what lies beyond is stored as this."""
+"""65.535 m; larger depths are stored as this."""
 
 
 def to_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -56,7 +56,7 @@ def to_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 @contextmanager
 def _plain_os_errors() -> Iterator[None]:
-    """Say what went wrong in a few words: HDF5 spreads a full disk over several lines, at times as a RuntimeError."""
+    """Raise a short OSError: HDF5 describes a full disk in several lines, sometimes as a RuntimeError."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -71,7 +71,7 @@ class StoreWriter:
     Args:
         path: the file, overwritten.
         size: (height, width) of images and depths.
-        native: whether each pair brings its truth at native resolution.
+        native: whether each pair has ground truth at native resolution.
 
     Raises:
         OSError: from here and from every method, if the file cannot be written.
@@ -100,13 +100,13 @@ class StoreWriter:
         depth_mm: NDArray[np.uint16],
         native_png: NDArray[np.uint8] | None,
     ) -> None:
-        """Add one pair at training size, with its native truth as an encoded 16-bit PNG if the store has them.
+        """Add one pair at training size, with its native ground truth as an encoded 16-bit PNG if the store has them.
 
         Raises:
-            ValueError: if the store has native truth and the pair brings none, or the other way round.
+            ValueError: if the pair has native ground truth and the store has none, or vice versa.
         """
         if self._native != (native_png is not None):
-            raise ValueError(f"'{record.id}': native truth must be given for each pair of a store or for none.")
+            raise ValueError(f"'{record.id}': either all pairs of a store have native ground truth or none.")
         row = len(self._records)
         with _plain_os_errors():
             if row == len(self._image):  # grow by doubling: a resize rewrites the index of chunks
@@ -139,14 +139,14 @@ class StoreWriter:
             self._file.close()
 
     def abort(self) -> None:
-        """Close the file without writing what is not written yet; nothing will take it for a store."""
+        """Close the unfinished file."""
         if not self._file:
             return
-        # HDF5 cannot drop what it holds back, and crashes at exit if it cannot write it: let it write to nowhere.
+        # HDF5 cannot discard its buffers, and crashes at exit if it cannot write them: let it write to nowhere.
         nowhere = os.open(os.devnull, os.O_RDWR)
         os.dup2(nowhere, self._file.id.get_vfd_handle())
         os.close(nowhere)
-        with suppress(OSError, RuntimeError):  # a flush that stopped half-way leaves HDF5 confused, but closed
+        with suppress(OSError, RuntimeError):  # an interrupted flush still closes the file
             self._file.close()
 
 
@@ -169,7 +169,7 @@ class DepthStore:
             with h5py.File(self.path, "r") as file:
                 if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
                     raise DataError(
-                        f"'{self.path}' is no depth store of version {VERSION}. Delete it and prepare again."
+                        f"'{self.path}' is not a depth store of version {VERSION}. Delete it and prepare again."
                     )
                 self.info: dict[str, Any] = json.loads(file.attrs["info"])
                 self.size: tuple[int, int] = tuple(file["image"].shape[1:3])
@@ -209,7 +209,7 @@ class DepthStore:
         return images, depths
 
     def read_ahead(self, first: int, last: int) -> None:
-        """Ask the system to read neighbouring pairs from the disk in one go; a hint, and nothing where it takes none.
+        """Ask the system to read neighbouring pairs from the disk in one go, if it takes such hints.
 
         Args:
             first: position of the first pair.
@@ -228,14 +228,14 @@ class DepthStore:
                     )
 
     def read_native(self, index: int) -> NDArray[np.float32]:
-        """Read one truth at its native resolution: [H, W] metres, 0 where unmeasured.
+        """Read one ground truth at its native resolution: [H, W] metres, 0 where unmeasured.
 
         Raises:
-            DataError: if the store was prepared without native truth.
+            DataError: if the store was prepared without native ground truth.
         """
         if not self.has_native:
             raise DataError(
-                f"'{self.path}' holds no native-resolution truth, which this protocol scores against. "
+                f"'{self.path}' has no native-resolution ground truth, which this protocol needs. "
                 "Pass data.native=true, or protocol=paper."
             )
         file = self._handle.get(self.path)
@@ -243,7 +243,6 @@ class DepthStore:
         start = int(ends[index - 1]) if index else 0
         mm = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
         if mm is None:
-            raise DataError(
-                f"'{self.path}': the truth of '{self.records[index].id}' is damaged. Delete it and prepare again."
-            )
+            what = f"the ground truth of '{self.records[index].id}' is damaged"
+            raise DataError(f"'{self.path}': {what}. Delete it and prepare again.")
         return mm.astype(np.float32) / np.float32(MM_PER_M)

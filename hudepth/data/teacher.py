@@ -1,4 +1,4 @@
-"""Depths that another model predicted for training images, read beside the truth: what distillation learns from."""
+"""A teacher's depths of the training images, read alongside the ground truth: the targets of distillation."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ ENDINGS = (".npy", ".png", "_depth.npy", "_depth.png")
 class TeacherDepths:
     """A teacher's depths at the training size, prepared once from a folder of files.
 
-    A ``.npy`` holds floats: metres, or whatever an affine-invariant loss makes of them; a ``.png`` 16-bit millimetres.
-    What is not finite or not positive is taken for not predicted.
+    A ``.npy`` holds floats: metres, or any unit if the loss is affine-invariant; a ``.png`` 16-bit millimetres.
+    Values that are not finite or not positive count as missing.
 
     Args:
         folder: with a file for each training pair: its id, then one of :data:`ENDINGS`.
@@ -58,7 +58,7 @@ class TeacherDepths:
         ]
         name = f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
         self.path = store.path.with_name(name)
-        if not self.path.exists():  # first without the lock, which a cache that can only be read has no place for
+        if not self.path.exists():  # try without the lock first, for caches that are read-only
             with FileLock(self.path.with_suffix(".lock")):
                 if not self.path.exists():
                     _prepare(files, records, store, self.path)
@@ -89,7 +89,7 @@ def _find(root: Path, records: Sequence[Record]) -> list[Path]:
     if missing:
         raise DataError(
             f"distill.teacher: {len(missing)} of {len(records)} training pairs have no depth in '{root}', the first is "
-            f"'{missing[0]}': no {missing[0]}.npy or .png. Predict them with hudepth-predict, or lay them there."
+            f"'{missing[0]}': no {missing[0]}.npy or .png. Predict them with hudepth-predict, or copy them there."
         )
     return files
 
@@ -125,6 +125,7 @@ def _read(file: Path) -> NDArray[np.float32]:
     wanted = "fiu" if file.suffix == ".npy" else "u"
     if depth.ndim != 2 or depth.dtype.kind not in wanted or (file.suffix == ".png" and depth.dtype.itemsize != 2):
         raise DataError(
-            f"distill.teacher: '{file}' is no depth map: a .npy of numbers [height, width], or a 16-bit grey .png [mm]."
+            f"distill.teacher: '{file}' is not a depth map: a .npy of numbers [height, width], "
+            "or a 16-bit grey .png [mm]."
         )
     return depth.astype(np.float32) / np.float32(1 if file.suffix == ".npy" else 1000)

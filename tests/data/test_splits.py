@@ -224,14 +224,14 @@ def test_a_file_that_is_no_split(saved: tuple[Path, list[Record], Split], damage
     path.write_text(json.dumps(damage(json.loads(path.read_text()))))
     with pytest.raises(DataError) as caught:
         load_split(path, records)
-    assert str(caught.value) == f"'{path}' is no split.json ({reason})."
+    assert str(caught.value) == f"'{path}' is not a split.json ({reason})."
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"\xff\xfe\x00"])
 def test_a_file_that_is_no_json(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "split.json"
     path.write_bytes(data)
-    with pytest.raises(DataError, match=r"split\.json' is no split\.json \((JSON|Unicode)DecodeError: .*\)\.$"):
+    with pytest.raises(DataError, match=r"split\.json' is not a split\.json \((JSON|Unicode)DecodeError: .*\)\.$"):
         load_split(path, [])
 
 
@@ -240,7 +240,7 @@ def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         load_split(path, [])
     assert str(caught.value) == (
-        f"'{path}' is no split.json (FileNotFoundError: [Errno 2] No such file or directory: '{path}')."
+        f"'{path}' is not a split.json (FileNotFoundError: [Errno 2] No such file or directory: '{path}')."
     )
 
 

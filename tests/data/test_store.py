@@ -174,7 +174,7 @@ def test_without_native_truth(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         store.read_native(0)
     assert str(caught.value) == (
-        f"'{path}' holds no native-resolution truth, which this protocol scores against. "
+        f"'{path}' has no native-resolution ground truth, which this protocol needs. "
         "Pass data.native=true, or protocol=paper."
     )
 
@@ -183,7 +183,7 @@ def test_without_native_truth(tmp_path: Path) -> None:
 def test_a_pair_brings_native_truth_as_its_store_does(tmp_path: Path, native: bool) -> None:
     writer = StoreWriter(tmp_path / "a.h5", size=SIZE, native=native)
     depth = np.ones(SIZE, np.uint16)
-    with pytest.raises(ValueError, match="'x': native truth must be given for each pair of a store or for none"):
+    with pytest.raises(ValueError, match="'x': either all pairs of a store have native ground truth or none"):
         writer.append(Record("x", "", 0), np.zeros((*SIZE, 3), np.uint8), depth, None if native else png(depth))
     writer.abort()
 
@@ -195,7 +195,7 @@ def test_damaged_native_truth_names_the_pair(filled: tuple[Any, ...]) -> None:
         file["native/png"][start : start + 8] = 0
     with pytest.raises(DataError) as caught:
         store.read_native(2)
-    assert str(caught.value) == f"'{store.path}': the truth of '02' is damaged. Delete it and prepare again."
+    assert str(caught.value) == f"'{store.path}': the ground truth of '02' is damaged. Delete it and prepare again."
     store.read_native(3)
 
 
@@ -230,7 +230,7 @@ def test_a_foreign_hdf5_file(tmp_path: Path) -> None:
         file["image"] = np.zeros((1, *SIZE, 3))
     with pytest.raises(DataError) as caught:
         DepthStore(path)
-    assert str(caught.value) == f"'{path}' is no depth store of version 1. Delete it and prepare again."
+    assert str(caught.value) == f"'{path}' is not a depth store of version 1. Delete it and prepare again."
 
 
 def test_another_version(filled: tuple[Any, ...]) -> None:
@@ -239,7 +239,7 @@ def test_another_version(filled: tuple[Any, ...]) -> None:
         file.attrs["version"] = 2
     with pytest.raises(DataError) as caught:
         DepthStore(path)
-    assert str(caught.value) == f"'{path}' is no depth store of version 1. Delete it and prepare again."
+    assert str(caught.value) == f"'{path}' is not a depth store of version 1. Delete it and prepare again."
 
 
 def test_an_unfinished_file(tmp_path: Path) -> None:

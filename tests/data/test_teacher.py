@@ -309,7 +309,7 @@ def test_what_is_no_depth_map(store: DepthStore, folder: Path, suffix: str, cont
     with pytest.raises(DataError) as caught:
         TeacherDepths(folder, store, range(N))
     assert str(caught.value) == (
-        f"distill.teacher: '{file}' is no depth map: a .npy of numbers [height, width], or a 16-bit grey .png [mm]."
+        f"distill.teacher: '{file}' is not a depth map: a .npy of numbers [height, width], or a 16-bit grey .png [mm]."
     )
 
 

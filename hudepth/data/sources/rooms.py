@@ -77,7 +77,7 @@ class RoomsSource(Source):
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The camera: row v, column u at depth z lies at x = (u - cx) z / fx, y = (v - cy) z / fy."""
+        """The camera: row v, column u at depth z is at x = (u - cx) z / fx, y = (v - cy) z / fy."""
         return Intrinsics.of_nyu(*self.size)
 
     def records(self) -> Sequence[Record]:
