@@ -71,10 +71,8 @@ def find_images(
         source = RoomsSource(scenes=-(-most // 4), frames_per_scene=4)
         images = np.stack([resize_image(source.read(record).image, size) for record in source.records()[:most]])
         return ComparisonImages(images[:compared], images[:calibration], "synthetic rooms")
-    test, train = (
-        _read(datamodule, datamodule.split[subset], count, size)
-        for subset, count in (("test", compared), ("train", calibration))
-    )
+    test = _read(datamodule, datamodule.split["test"], compared, size)
+    train = _read(datamodule, datamodule.split["train"], calibration, size)
     return ComparisonImages(test, train, f"test images of {datamodule.source.name}", datamodule)
 
 

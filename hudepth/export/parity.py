@@ -28,14 +28,7 @@ class Parity:
 def compare(
     exported: Backend, reference: Backend, images: UInt8[np.ndarray, "n h w 3"], *, batch_size: int = 5
 ) -> Parity:
-    """Predict the same images twice.
-
-    Args:
-        exported: the file.
-        reference: the checkpoint.
-        images: RGB at the model's size.
-        batch_size: images at a time; more than one also tests the batch axis.
-    """
+    """Predict the same RGB images twice, several at a time, which also tests the batch axis."""
     worst, total = 0.0, 0.0
     for at in range(0, len(images), batch_size):
         batch = np.ascontiguousarray(images[at : at + batch_size])
@@ -46,11 +39,7 @@ def compare(
 
 
 def check(parity: Parity, *, what: str, tolerance_mm: float) -> None:
-    """Refuse a file whose difference exceeds the tolerance.
-
-    Raises:
-        CheckpointError: if it does.
-    """
+    """Raise CheckpointError if the difference exceeds the tolerance."""
     if not parity.worst_mm <= tolerance_mm:
         raise CheckpointError(
             f"{what}: {parity.worst_mm:.3g} mm from the checkpoint at the worst pixel, the limit is {tolerance_mm:g}. "

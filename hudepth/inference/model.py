@@ -56,9 +56,6 @@ class DepthModel:
     def predict(self, image: Picture) -> DepthMap:
         """Predict the depth of one image, at its own size.
 
-        Args:
-            image: a path, the bytes of a file, an array [h, w(, channels)] or a Pillow image.
-
         Raises:
             DataError: if the image cannot be read.
         """
@@ -66,11 +63,7 @@ class DepthModel:
         return self.finish(prepared, self.run([prepared])[0])
 
     def predict_many(self, images: Iterable[Picture], *, batch_size: int = 1) -> list[DepthMap]:
-        """Predict the depth of several images.
-
-        Args:
-            images: see :meth:`predict`.
-            batch_size: images that go through the network together.
+        """Predict the depth of several images, ``batch_size`` at a time.
 
         Raises:
             DataError: if one cannot be read.
@@ -80,11 +73,7 @@ class DepthModel:
         return [self.finish(each, depth) for each, depth in zip(prepared, depths, strict=True)]
 
     def prepare(self, image: Picture) -> Prepared:
-        """Decode an image and resize it to the network's input.
-
-        Raises:
-            DataError: if it cannot be read.
-        """
+        """Decode an image and resize it to the network's input; raises DataError if it cannot be read."""
         if isinstance(image, Image.Image):
             image = np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
         photo = Photo(as_rgb(image), ()) if isinstance(image, np.ndarray) else read_photo(image)
