@@ -33,17 +33,7 @@ def write_bundle(
     results: Mapping[str, Mapping[str, Any]],
     samples: Sequence[DepthMap],
 ) -> None:
-    """Write a bundle into a new folder.
-
-    Args:
-        folder: is created.
-        checkpoint: tensors and record of the training.
-        info: its description.
-        onnx: file to copy, if the bundle has one.
-        card: the model card.
-        results: contents of ``metrics.json`` by protocol.
-        samples: predictions to show.
-    """
+    """Write a bundle into a new folder; ``results`` are contents of ``metrics.json`` by protocol."""
     from safetensors.torch import save
 
     folder.mkdir(parents=True)

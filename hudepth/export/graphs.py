@@ -55,12 +55,7 @@ def describe(info: ModelInfo) -> dict[str, str]:
 
 
 def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
-    """Write an ONNX file for any batch size, with torch's dynamo exporter.
-
-    Args:
-        net: normalised image to unit depth.
-        path: ``.onnx``, written whole or not at all.
-        info: its description.
+    """Write a network (normalised image to unit depth) as ONNX for any batch size, with torch's dynamo exporter.
 
     Raises:
         ConfigError: if ``onnx`` or ``onnxscript`` is not installed.

@@ -55,9 +55,9 @@ def measure_int8(
         checkpoint: what was quantised.
         reference: its network as trained.
         quantised: its int8 form.
-        datamodule: with the test subset.
-        protocols: configurations of the test protocols.
-        trust: packages whose classes they may name.
+        datamodule: provides the test subset.
+        protocols: configurations, whose classes must be hudepth's or under ``trust``.
+        trust: further packages.
 
     Returns:
         By protocol and metric: both values, their difference and its 95 % interval over scenes.

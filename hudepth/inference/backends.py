@@ -85,13 +85,7 @@ class TorchBackend:
     def of_checkpoint(
         cls, checkpoint: Checkpoint, *, device: torch.device, trust: list[str], size: tuple[int, int] | None = None
     ) -> TorchBackend:
-        """Return a checkpoint's network in its fastest exact form.
-
-        Args:
-            checkpoint: what to run.
-            device: where.
-            trust: further modules whose classes its configuration may name.
-            size: (height, width) of its input; default: that of its training.
+        """Return a checkpoint's network in its fastest exact form; ``size`` as in :func:`hudepth.inference.model.load`.
 
         Raises:
             HudepthError: if the network cannot be built or does not take the size.
@@ -102,13 +96,7 @@ class TorchBackend:
 
 
 class GraphBackend:
-    """An exported file, on the CPU.
-
-    Args:
-        name: of the backend.
-        info: the file's description; states whether the graph holds pre- and post-processing.
-        compute: runs the graph.
-    """
+    """An exported file, on the CPU; ``info`` states whether the graph holds pre- and post-processing."""
 
     def __init__(self, name: str, info: ModelInfo, compute: Callable[[NDArray[Any]], NDArray[Any]]) -> None:
         self.name, self.info, self._compute = name, info, compute
@@ -126,12 +114,7 @@ def open_exported(
 ) -> GraphBackend:
     """Open an exported file.
 
-    Args:
-        path: ``.onnx``, ``.xml`` or ``.pt2``.
-        backend: ``auto`` reads ONNX with OpenVINO if that is installed, since it is faster.
-        threads: to compute with.
-        trust: must contain ``pt2`` for a ``.pt2`` file.
-        precision: ``bfloat16`` with OpenVINO only.
+    ``auto`` reads ONNX with OpenVINO if installed, since it is faster. ``.pt2`` files need ``pt2`` in ``trust``.
 
     Raises:
         CheckpointError: if it cannot be read, is not trusted, or was not exported by hudepth.

@@ -40,13 +40,7 @@ metres, ``colour`` and ``side`` are pictures with a scale."""
 
 
 def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Style) -> None:
-    """Write ``<stem>_depth.png`` and so on, each whole or not at all.
-
-    Args:
-        stem: path without an ending.
-        depth: what to write.
-        formats: names in :data:`FORMATS`.
-        style: of pictures and clouds.
+    """Write ``<stem>_depth.png`` and so on in formats of :data:`FORMATS`, each whole or not at all.
 
     Raises:
         OSError: if a file cannot be written.

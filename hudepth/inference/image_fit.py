@@ -25,13 +25,9 @@ class Fitted(NamedTuple):
 
 
 def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: Fit, aspect: float) -> Fitted:
-    """Resize an image to the network's input.
+    """Resize an RGB image to the network's input of (height, width).
 
-    Args:
-        image: RGB.
-        size: (height, width) of the input.
-        fit: how.
-        aspect: width over height of the training images before they were resized.
+    ``aspect`` is width over height of the training images before they were resized; ``letterbox`` pads to it.
     """
     height, width = size
     relative = image.shape[1] / image.shape[0] / aspect  # above 1: wider than the training images
@@ -50,12 +46,6 @@ def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: 
 def unfit_depth(
     depth_m: Float[np.ndarray, "h w"], box: tuple[slice, slice], size: tuple[int, int]
 ) -> Float[np.ndarray, "H W"]:
-    """Resize the depth of a fitted image to the image's own (height, width), bilinearly.
-
-    Args:
-        depth_m: at the network's size [m].
-        box: where the image lies in it.
-        size: (height, width) of the image.
-    """
+    """Resize the depth of a fitted image to the image's own (height, width), bilinearly."""
     inside = np.ascontiguousarray(depth_m[box])
     return np.asarray(cv2.resize(inside, (size[1], size[0]), interpolation=cv2.INTER_LINEAR), np.float32)

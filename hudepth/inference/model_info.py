@@ -71,12 +71,7 @@ class ModelInfo:
     def of_checkpoint(
         cls, checkpoint: Checkpoint, *, parameters: int, size: tuple[int, int] | None = None
     ) -> ModelInfo:
-        """Describe a checkpoint.
-
-        Args:
-            checkpoint: what to describe.
-            parameters: of its network.
-            size: (height, width) of its input; default: that of its training.
+        """Describe a checkpoint, at the input size of its training unless another is given.
 
         Raises:
             CheckpointError: if it does not record its training data.

@@ -27,15 +27,7 @@ def onnx_session(path: Path, *, threads: int) -> Any:
 
 
 def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:
-    """Open an IR (``.xml`` next to its ``.bin``) or ONNX file in OpenVINO, on the CPU.
-
-    Args:
-        path: the file.
-        threads: to compute with.
-        precision: a key of :data:`PRECISIONS`.
-
-    Returns:
-        The model as read, and an inference request.
+    """Open an IR (``.xml`` next to its ``.bin``) or ONNX file in OpenVINO: the model as read, and an inference request.
 
     Raises:
         ConfigError: if OpenVINO is not installed.

@@ -34,7 +34,7 @@ def depth_of(payload: dict[str, object]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_strangers_file_is_answered_in_a_line(tmp_path: Path, model: DepthModel, name: str) -> None:
+def test_a_bad_file_is_answered_in_a_line(tmp_path: Path, model: DepthModel, name: str) -> None:
     data, expected = HOSTILE[name]
     with pytest.raises(DataError) as caught:
         answered(tmp_path, model, data, name)

@@ -196,7 +196,7 @@ def test_a_picture_can_be_pasted(tab: Any) -> None:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_strangers_file_is_a_message(tab: Any, name: str) -> None:
+def test_a_bad_file_is_a_message(tab: Any, name: str) -> None:
     data, expected = HOSTILE[name]
     send(tab, name, data)
     tab.locator(".hd-message", has_text=expected).wait_for(timeout=10_000)
