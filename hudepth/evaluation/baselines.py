@@ -1,4 +1,4 @@
-"""Trivial baselines that any model must beat, made from the training subset alone."""
+"""Trivial baselines that any model must beat, computed from the training subset alone."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _CHUNK = 64
 
 
 class Baseline(nn.Module):
-    """Answers without a network. Mirrored images are none of its business: test-time flips leave it alone."""
+    """A predictor without a network; test-time flips do not apply to it."""
 
 
 class ConstantDepth(Baseline):
-    """Answers every image with the same unit depth map.
+    """Predicts the same unit depth map for every image.
 
     Args:
         unit_depth: [1, 1, h, w].
@@ -37,20 +37,20 @@ class ConstantDepth(Baseline):
         self.register_buffer("unit_depth", unit_depth)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the map, once for each image."""
+        """Return the map once per image."""
         return self.unit_depth.expand(len(image), -1, -1, -1)
 
 
 class NearestFrame(Baseline):
-    """Copies the depth of the training image that looks most alike.
+    """Copies the depth of the most similar training image.
 
-    It has learnt nothing. Where it comes near a network, test images have near duplicates in training.
+    Where it comes close to a network, test images have near duplicates in the training subset.
 
     Args:
         store: holds the depths.
         train: positions of the training pairs.
         descriptors: of the training images, as :func:`descriptor` makes them.
-        fill: unit depth where the copied truth is unmeasured, [1, 1, h, w].
+        fill: unit depth where the copied depth is unmeasured, [1, 1, h, w].
         max_depth_m: depth is clipped to it and divided by it.
     """
 
@@ -72,26 +72,26 @@ class NearestFrame(Baseline):
         self._store, self._train, self._max_depth_m = store, list(train), max_depth_m
 
     def nearest(self, image: Float[Tensor, "b 3 h w"]) -> list[int]:
-        """Return the store positions of the training images most alike normalised images."""
+        """Return the store positions of the training images most similar to normalised images."""
         query = descriptor(image)
-        # |a - b|^2 less |a|^2, which does not change which b is nearest
+        # |a - b|^2 - |a|^2: the same b is nearest
         distance = self.descriptors.square().sum(dim=1) - 2 * query @ self.descriptors.T
         return [self._train[i] for i in distance.argmin(dim=1).tolist()]
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the depth of the nearest training image, once for each image."""
+        """Return the depth of the nearest training image of each image."""
         _, depth_mm = self._store.read(self.nearest(image))
         unit = _unit_depth(depth_mm, self._max_depth_m).float()[:, None].to(image.device)
         return torch.where(unit > 0, unit, self.fill)
 
 
 def descriptor(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
-    """Describe images by a thumbnail of their normalised colours, averaged over areas."""
+    """Return thumbnails of normalised images, averaged over areas."""
     return functional.adaptive_avg_pool2d(image.float(), DESCRIPTOR_SIZE).flatten(1)
 
 
 def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: float) -> dict[str, Baseline]:
-    """Make the baselines in one pass over the training pairs.
+    """Compute the baselines in one pass over the training pairs.
 
     Args:
         store: holds the pairs.
@@ -99,7 +99,7 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
         max_depth_m: depth is clipped to it and divided by it.
 
     Returns:
-        ``nearest_frame``: the depth of the training image most alike; ``mean_depth_map``: each pixel's mean over the
+        ``nearest_frame``: the depth of the most similar training image; ``mean_depth_map``: each pixel's mean over the
         training set; ``mean_depth``: one mean for all pixels.
     """
     total = torch.zeros(store.size, dtype=torch.float64)
@@ -108,7 +108,7 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
     starts = range(0, len(train), _CHUNK)
     for start in track(starts, total=len(starts), what="trivial baselines"):
         images, depth_mm = store.read(train[start : start + _CHUNK])
-        # pooled before it is normalised: the order does not matter, and the thumbnail is smaller
+        # pooling first gives the same result faster
         small = functional.adaptive_avg_pool2d(torch.from_numpy(images).permute(0, 3, 1, 2).float(), DESCRIPTOR_SIZE)
         described.append(normalise_image(small / 255).flatten(1))
         unit = _unit_depth(depth_mm, max_depth_m)

@@ -1,4 +1,4 @@
-"""Panels of a finished run, drawn anew from its checkpoint and its data."""
+"""Predictions of a network as panels, for pictures."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from hudepth.viz.panels import Panel
 def run_panels(
     run: Path, choose: Callable[[DepthDataModule], Sequence[int]], *, config: Mapping[str, Any]
 ) -> list[Panel]:
-    """Predict some pairs of a run's data with its best checkpoint.
+    """Predict pairs of a run's data with its best checkpoint.
 
     Args:
         run: the run directory.
         choose: returns the positions of the pairs in the depth store.
-        config: with ``paths``, ``data`` (keys that stand above the checkpoint's) and ``trust``.
+        config: with ``paths``, ``data`` (overrides of the checkpoint's) and ``trust``.
 
     Raises:
-        HudepthError: if the checkpoint or the data is not there or not what it was.
+        HudepthError: if the checkpoint or its data is missing or has changed.
     """
     checkpoint = load_checkpoint(str(run))
     typed = {"cache": config["paths"]["cache"], **config["data"]}
@@ -42,22 +42,21 @@ def run_panels(
 
 
 def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mapping[str, Any]) -> list[Panel]:
-    """Predict the same images with several runs: for each image a row a run, titled with the run's name.
+    """Predict the same images with several runs; return one panel per image and run, titled with the run's name.
 
     Args:
-        runs: run directories by the name to show.
+        runs: run directories by name.
         ids: of the images.
         config: as for :func:`run_panels`.
 
     Raises:
-        HudepthError: as :func:`run_panels`, or if a run's data does not have an image.
+        HudepthError: as :func:`run_panels`, or if a run's data lacks an image.
     """
 
     def positions(datamodule: DepthDataModule) -> list[int]:
         known = {record.id: position for position, record in enumerate(datamodule.store.records)}
-        lacking = [image for image in ids if image not in known]
-        if lacking:
-            raise DataError(f"the data has no image '{lacking[0]}'.")
+        if missing := [image for image in ids if image not in known]:
+            raise DataError(f"the data has no image '{missing[0]}'.")
         return [known[image] for image in ids]
 
     rows = [
@@ -69,20 +68,20 @@ def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mappi
 
 @torch.inference_mode()
 def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float) -> list[Panel]:
-    """Predict some pairs of a store and return them as rows of a picture.
+    """Predict pairs of a store.
 
     Args:
         module: normalised image to unit depth.
         store: holds the pairs.
-        indices: which of them.
-        max_depth_m: what unit depth 1 stands for.
+        indices: positions of the pairs.
+        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
     """
     panels = []
     was_training = module.training
     module.eval()
     device = next(module.parameters()).device
     dataset = StoreDataset(store, indices)
-    for position in range(len(dataset)):  # no DataLoader: it would draw from the generator that training draws from
+    for position in range(len(dataset)):  # a DataLoader would advance the random generator of the training
         raw = dataset[position]
         batch = preprocess(raw, max_depth_m=max_depth_m)
         pred_m = module(batch["image"].to(device)).float().cpu()[0, 0] * max_depth_m
@@ -94,6 +93,6 @@ def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *,
 
 
 def evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
-    """Pick ``count`` of ``indices`` (all, if there are fewer), evenly spaced, always the same."""
+    """Return ``count`` of ``indices``, evenly spaced; all if there are fewer."""
     count = min(count, len(indices))
     return [indices[i * len(indices) // count] for i in range(count)]

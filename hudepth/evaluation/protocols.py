@@ -15,11 +15,11 @@ def build_protocols(protocols: Mapping[str, Any], *, datamodule: DepthDataModule
     """Build the test protocols of a configuration, in its order.
 
     Raises:
-        ConfigError: if there is none, one cannot be built, or one needs what the data is prepared without.
+        ConfigError: if there is none, if one cannot be built, or if one needs native depth and the data has none.
     """
     built = [instantiate(protocol, trust=trust, only=Protocol) for protocol in protocols.values() if protocol]
     if not built:
-        raise ConfigError("protocol: none is given. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
+        raise ConfigError("protocol: none is set. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
     native = [protocol.name for protocol in built if protocol.needs_native]
     if native and not datamodule.native:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""One pass over a test subset: any number of predictors, scored under any number of protocols."""
+"""One pass over a test subset that scores predictors under protocols."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from hudepth.metrics.protocol import Protocol
 
 
 class Evaluation(LightningModule):
-    """Collects, for each predictor and protocol, one row of sums an image. Run it with ``Trainer.test``.
+    """Collects one row of sums per image for each predictor and protocol. Run it with ``Trainer.test``.
 
     Args:
         predictors: by name; normalised image to unit depth.
         protocols: how to score.
-        max_depth_m: what unit depth 1 stands for.
-        detailed: the predictor whose boundaries and strata are measured too, where a protocol asks for them.
+        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
+        detailed: the predictor whose boundaries and strata are measured too, if a protocol asks for them.
 
     Raises:
-        ConfigError: if two protocols have one name, which would mix their rows.
+        ConfigError: if two protocols have the same name.
     """
 
     def __init__(
@@ -42,17 +42,17 @@ class Evaluation(LightningModule):
         self.protocols = list(protocols)
         names = [protocol.name for protocol in protocols]
         if len(set(names)) < len(names):
-            raise ConfigError(f"protocol: two have one name among {', '.join(names)}. Give each its own name.")
+            raise ConfigError(f"protocol: two have the same name among {', '.join(names)}. Give each its own name.")
         self.max_depth_m, self.detailed = max_depth_m, detailed
         self._collected: dict[tuple[str, ...], list[Tensor]] = {}
         self.indices: list[int] = []
         """Store positions of the scored images, in the order of the rows; known when the test has ended."""
         self.sums: dict[tuple[str, str], Float64[Tensor, "n k"]] = {}
-        """Rows by predictor and protocol, an image each; known when the test has ended."""
+        """Rows by predictor and protocol; known when the test has ended."""
         self.boundary: dict[str, Float64[Tensor, "n k"]] = {}
-        """Boundary metrics of the detailed predictor by protocol, an image a row, where asked for."""
+        """Boundary metrics of the detailed predictor by protocol, one row per image."""
         self.strata: dict[str, Float64[Tensor, "n bins k"]] = {}
-        """Sums over strata of the detailed predictor by protocol, where asked for."""
+        """Sums over strata of the detailed predictor by protocol."""
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score a batch."""
@@ -71,7 +71,7 @@ class Evaluation(LightningModule):
                     self._keep(scores.strata(protocol), "strata", protocol.name)
 
     def _predict(self, predictor: nn.Module, image: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the prediction [m], and its mean with that of the mirrored image if a protocol wants it."""
+        """Return the prediction [m], and its mean with that of the mirrored image if a protocol needs it."""
         plain: Tensor = predictor(image).float() * self.max_depth_m
         if isinstance(predictor, Baseline) or not any(protocol.flip for protocol in self.protocols):
             return plain, None

@@ -1,11 +1,11 @@
-"""Bundles: a model as a folder or zip to hand on, with weights that cannot hold code; the layout of model hubs.
+"""Bundles: a model as a folder or zip to share, in the layout of model hubs, with weights that cannot hold code.
 
 ====================  ===============================================================================
 README.md             the model card
-config.json           model, data and split as in a checkpoint, without the places on the machine it comes from
+config.json           model, data and split as in a checkpoint, without paths of the machine it was made on
 model.safetensors     the network's tensors
 model.onnx            RGB bytes in, metres out
-metrics/              test results, one file a protocol
+metrics/              test results, one file per protocol
 samples/              pictures
 ====================  ===============================================================================
 """
@@ -23,13 +23,13 @@ from hudepth.base.errors import CheckpointError
 CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
 KIND = "hudepth-bundle"
 PRETRAINED = ("nyu",)
-"""Names that ``checkpoint=`` keeps for models that come with hudepth: ``nyu``, from ``experiments/strong_official``."""
+"""Names of the bundled pretrained models for ``checkpoint=``: ``nyu``, from ``experiments/strong_official``."""
 MAX_CONFIG_BYTES = 1 << 22
 MAX_WEIGHTS_BYTES = 1 << 32
 
 
 def pretrained(name: str) -> Path:
-    """Return the folder of a model that comes with hudepth.
+    """Return the folder of a bundled pretrained model.
 
     Args:
         name: one of :data:`PRETRAINED`.
@@ -42,7 +42,7 @@ def pretrained(name: str) -> Path:
     folder = next((path for root in folders if is_bundle(path := Path(root) / name)), None)
     if folder is None:
         raise CheckpointError(
-            f"checkpoint: the weights of '{name}' are not part of this installation. Install hudepth anew, or pass a "
+            f"checkpoint: the weights of '{name}' are not part of this installation. Install hudepth again, or pass a "
             "run or a file."
         )
     return folder
@@ -62,10 +62,10 @@ def read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Any], int]:
         path: a folder, its ``model.safetensors``, or a zip of the folder.
 
     Returns:
-        What a checkpoint says of itself, its tensors, and the bytes they were read from.
+        Its configuration, its tensors, and the number of bytes they were read from.
 
     Raises:
-        CheckpointError: if it is damaged, too large, holds paths outside its folder, or is no bundle.
+        CheckpointError: if it is damaged, too large, holds paths outside its folder, or is not a bundle.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -80,7 +80,7 @@ def read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Any], int]:
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"'{path}': its {CONFIG} cannot be read ({error}).") from error
     if not isinstance(content, dict) or content.get("kind") != KIND:
-        raise CheckpointError(f"'{path}' is no bundle of hudepth's. Make one with hudepth-export format=bundle.")
+        raise CheckpointError(f"'{path}' is not a bundle of hudepth. Make one with hudepth-export format=bundle.")
     try:
         tensors = load(weights)
     except (SafetensorError, ValueError, KeyError) as error:
@@ -93,7 +93,7 @@ def _from_folder(folder: Path) -> tuple[bytes, bytes]:
     for name, limit in ((CONFIG, MAX_CONFIG_BYTES), (WEIGHTS, MAX_WEIGHTS_BYTES)):
         file = folder / name
         if not file.is_file():
-            raise CheckpointError(f"'{folder}' is no bundle: it has no {name}. Pass the folder that has.")
+            raise CheckpointError(f"'{folder}' is not a bundle: it has no {name}. Pass the folder that has it.")
         if file.stat().st_size > limit:
             raise CheckpointError(f"'{file}' is refused: larger than {limit >> 20} MiB.")
         read.append(file.read_bytes())
@@ -108,14 +108,14 @@ def _from_zip(path: Path) -> tuple[bytes, bytes]:
             return _member(path, archive, CONFIG, MAX_CONFIG_BYTES), _member(path, archive, WEIGHTS, MAX_WEIGHTS_BYTES)
     except CheckpointError:
         raise
-    except Exception as error:  # zipfile knows a dozen ways in which a file can be broken
+    except Exception as error:  # zipfile raises many kinds
         raise CheckpointError(f"'{path}' cannot be read as a zip; it is damaged or cut off ({error}).") from error
 
 
 def _check_inside(path: Path, name: str) -> None:
     windows = PureWindowsPath(name)
     if name.startswith("/") or windows.anchor or ".." in {*PurePosixPath(name).parts, *windows.parts}:
-        raise CheckpointError(f"'{path}' is refused: it holds '{name}', which leads out of its folder.")
+        raise CheckpointError(f"'{path}' is refused: it holds '{name}', a path outside its folder.")
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
@@ -123,8 +123,8 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> byte
     found = [entry for entry in archive.infolist() if PurePosixPath(entry.filename).name == name]
     found = [entry for entry in found if len(PurePosixPath(entry.filename).parts) <= 2]
     if len(found) != 1:
-        raise CheckpointError(f"'{path}' is no bundle of hudepth's: it has {len(found) or 'no'} {name}.")
-    # weights hardly compress: what grows tenfold is made to fill the memory
+        raise CheckpointError(f"'{path}' is not a bundle of hudepth: it has {len(found) or 'no'} {name}.")
+    # weights hardly compress: a file that grows tenfold is made to fill memory
     if found[0].file_size > min(limit, 10 * path.stat().st_size + MAX_CONFIG_BYTES):
         raise CheckpointError(f"'{path}' is refused: its {name} unpacks to {found[0].file_size >> 20} MiB.")
     with archive.open(found[0]) as file:

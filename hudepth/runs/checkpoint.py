@@ -16,7 +16,7 @@ from hudepth.base.errors import CheckpointError, TrainingError
 from hudepth.base.files import written_whole
 from hudepth.base.instantiate import instantiate
 from hudepth.runs import bundles
-from hudepth.runs.run import BEST, CHECKPOINTS, LAST, find_run, is_run, newest_run
+from hudepth.runs.run import best_checkpoint, find_run, is_run, newest_run
 
 KEY = "hudepth"
 """Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""
@@ -26,7 +26,7 @@ NET_PREFIX = "net."
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint beside its place, then renames it: a full disk or a kill never costs the previous one."""
+    """Writes to a temporary file, then renames it: a full disk or a kill never costs the previous checkpoint."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write ``checkpoint`` to ``path``, whole or not at all.
@@ -40,7 +40,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
             raise TrainingError(
                 f"the checkpoint '{path}' could not be saved ({_first_line(error)}). The previous one is intact: "
-                f"make space, then continue with hudepth-train resume={Path(path).parent.parent}"
+                f"free some space, then resume with hudepth-train resume={Path(path).parent.parent}"
             ) from error
 
 
@@ -50,11 +50,11 @@ def _first_line(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint, read and checked but not yet built into a network."""
+    """A checkpoint, read and checked; no network is built yet."""
 
     path: Path
     run: Path | None
-    """The run directory it lies in, None if it was moved elsewhere."""
+    """Its run directory, None if it was moved elsewhere."""
     config: dict[str, Any]
     """The run's resolved configuration."""
     split: dict[str, Any]
@@ -66,21 +66,20 @@ class Checkpoint:
     state: dict[str, Tensor]
     """The network's tensors."""
     size_bytes: int
-    """Of what the tensors were read from: no honest network is larger."""
+    """Of the file that the tensors were read from: no valid network is larger."""
 
     def build_net(self, *, trust: list[str]) -> nn.Module:
         """Return the network in evaluation mode.
 
-        It is first laid out without memory and compared with the checkpoint's tensors, so that a configuration which
-        asks for more than the file holds is an error and not an exhausted machine. Code that the user trusts can do
-        as it likes anyway and need not bear being built twice.
+        It is first built on the meta device and compared with the checkpoint's tensors, so that a configuration that
+        asks for more than the file holds cannot exhaust memory. Trusted code is built once, without this check.
 
         Args:
             trust: further modules whose classes the configuration may name.
 
         Raises:
-            CheckpointError: if the tensors are not those of the configured network.
-            ConfigError: if the configuration names something that is not trusted, or no network.
+            CheckpointError: if the tensors do not fit the configured network.
+            ConfigError: if the configuration names an untrusted class, or one that is not a network.
         """
         model = dict(self.config["model"])
         if "weights" in model:
@@ -96,10 +95,10 @@ class Checkpoint:
         return net.eval()
 
     def fill(self, net: nn.Module) -> None:
-        """Give a network these tensors.
+        """Load the tensors into a network.
 
         Raises:
-            CheckpointError: if they are not those of such a network.
+            CheckpointError: if they do not fit.
         """
         self._check_fits(net)
         net.load_state_dict(self.state)
@@ -107,17 +106,17 @@ class Checkpoint:
     def _check_fits(self, net: nn.Module) -> None:
         own, given = net.state_dict(), self.state
         names = {**own, **given}
-        unlike = [n for n in names if n not in own or n not in given or own[n].shape != given[n].shape]
-        if unlike:
+        misfits = [n for n in names if n not in own or n not in given or own[n].shape != given[n].shape]
+        if misfits:
             raise CheckpointError(
-                f"'{self.path}' is from another model: {len(unlike)} tensors do not fit "
-                f"{self.config['model'].get('_target_')}, the first is '{unlike[0]}'. "
+                f"'{self.path}' is from another model: {len(misfits)} tensors do not fit "
+                f"{self.config['model'].get('_target_')}, the first is '{misfits[0]}'. "
                 "Pass a checkpoint whose configuration matches its weights."
             )
 
 
 def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
-    """Return the file that ``spec`` means.
+    """Return the file or folder that ``spec`` refers to.
 
     Args:
         spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or
@@ -133,20 +132,18 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     if bundles.is_bundle(path):
         return path
     if path.is_dir():
-        folder = path / CHECKPOINTS
-        for name in (BEST, LAST):
-            if (folder / name).is_file():
-                return folder / name
+        if file := best_checkpoint(path):
+            return file
         if not is_run(path):
-            raise CheckpointError(f"checkpoint: the folder '{path}' is no run directory. Pass a file, a run, or last.")
-        raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint; its first epoch was never finished.")
+            raise CheckpointError(f"checkpoint: '{path}' is not a run directory. Pass a file, a run, or last.")
+        raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint: no epoch was finished. Resume it.")
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file or run directory '{path}'. Pass a file, a run directory, or last.")
     return path
 
 
 def read_plain(path: Path) -> dict[str, Any]:
-    """Read a file of plain types; anything else in it is refused unread.
+    """Read a file of plain types; files with anything else are refused without running code.
 
     Raises:
         CheckpointError: if the file is damaged, holds code, or unpacks to more than its own size.
@@ -162,18 +159,18 @@ def read_plain(path: Path) -> dict[str, Any]:
     except Exception as error:
         raise _damaged(path, error) from error
     if not isinstance(content, dict):
-        raise CheckpointError(f"'{path}' holds no checkpoint, but a {type(content).__name__}.")
+        raise CheckpointError(f"'{path}' is not a checkpoint: it holds a {type(content).__name__}. Pass another file.")
     return content
 
 
 def _check_archive(path: Path) -> None:
-    """Refuse a damaged file before any of it is taken for code, and one that a reader would blow up in memory."""
+    """Refuse a damaged file before any of it is unpickled, and one that unpacks to more than its size."""
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
             fits = unpacked <= path.stat().st_size  # torch.save does not compress
             broken = archive.testzip() if fits else None
-    except Exception as error:  # zipfile knows a dozen ways in which a file can be broken
+    except Exception as error:  # zipfile raises many kinds
         raise _damaged(path, error) from error
     if not fits:
         raise CheckpointError(
@@ -221,20 +218,9 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         and isinstance(epoch, int)
         and _is_state(tensors)
     ):
-        raise CheckpointError(
-            f"'{path}' is incomplete: its configuration, split, data, epoch or tensors are not there."
-        )
+        raise CheckpointError(f"'{path}' is incomplete: configuration, split, data, epoch or tensors are missing.")
     state = {n.removeprefix(NET_PREFIX): v for n, v in tensors.items() if n.startswith(NET_PREFIX)}
-    return Checkpoint(
-        path=path,
-        run=run,
-        config=config,
-        split=split,
-        data=data,
-        epoch=epoch,
-        state=state,
-        size_bytes=size_bytes,
-    )
+    return Checkpoint(path, run, config, split, data, epoch, state, size_bytes)
 
 
 def _fix_version(own: dict[str, Any]) -> str:

@@ -63,8 +63,7 @@ class Run:
     @property
     def checkpoint(self) -> Path | None:
         """The best checkpoint, else the last; None before the first epoch."""
-        files = (self.path / CHECKPOINTS / name for name in (BEST, LAST))
-        return next((file for file in files if file.is_file()), None)
+        return best_checkpoint(self.path)
 
     def history(self) -> list[dict[str, float]]:
         """Read metrics.csv, one row per epoch; see :func:`hudepth.runs.history.read_history`."""
@@ -110,6 +109,12 @@ def newest_run(runs: str | Path) -> Path:
             "or pass checkpoint=<file or run directory>."
         )
     return max(found, key=lambda run: (run / CHECKPOINTS).stat().st_mtime_ns)
+
+
+def best_checkpoint(run: Path) -> Path | None:
+    """Return the best checkpoint of a run directory, else the last; None before the first epoch."""
+    files = (run / CHECKPOINTS / name for name in (BEST, LAST))
+    return next((file for file in files if file.is_file()), None)
 
 
 def find_run(checkpoint: Path) -> Path | None:

@@ -62,11 +62,11 @@ def altered(bundle: Path, folder: Path, change: dict[str, bytes]) -> Path:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"../evil.txt": b"x"}, r"is refused: it holds '\.\./evil\.txt', which leads out of its folder"),
-        ({"/etc/evil": b"x"}, r"which leads out of its folder"),
-        ({"a/../../b": b"x"}, r"which leads out of its folder"),
-        ({"C:\\evil": b"x"}, r"which leads out of its folder"),
-        ({"config.json": b"{}"}, r"is no bundle of hudepth's"),
+        ({"../evil.txt": b"x"}, r"is refused: it holds '\.\./evil\.txt', a path outside its folder"),
+        ({"/etc/evil": b"x"}, r"a path outside its folder"),
+        ({"a/../../b": b"x"}, r"a path outside its folder"),
+        ({"C:\\evil": b"x"}, r"a path outside its folder"),
+        ({"config.json": b"{}"}, r"is not a bundle of hudepth"),
         ({"config.json": b"[" * 100_000}, r"its config.json cannot be read"),
         ({"model.safetensors": bytes(200_000_000)}, r"is refused: its model.safetensors unpacks to 190 MiB"),
         ({"model.safetensors": b"\xff" * 64}, r"its model.safetensors is damaged or cut off"),
