@@ -434,7 +434,7 @@ def test_a_failing_write_costs_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     why = str(error).splitlines()[0]
     assert str(caught.value) == (
         f"the checkpoint '{path}' could not be saved ({why}). The previous one is intact: "
-        f"make space, then continue with hudepth-train resume={run}"
+        f"free some space, then resume with hudepth-train resume={run}"
     )
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
