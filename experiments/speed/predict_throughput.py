@@ -4,7 +4,7 @@
 
 Blocks of the folder's images go through the default path twice, in turns: decoded, predicted and written as npy, 16-bit
 PNG and colour picture, as hudepth-predict does; and as arrays in memory through the network alone. The ratio of the two
-rates is what is left of the network's speed. Weights are random: they do not change the work.
+rates is the share of the network's speed that remains. Weights are random: they do not change the work.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What does a sweep cost beside its jobs, and what does running two at a time gain?
+"""What does a sweep cost in addition to its jobs, and what does running two at a time gain?
 
 Runs the same eight small trainings on rooms twice in turns, each time with fresh folders: one after the other in one
 process (the basic launcher), and side by side (joblib, as many processes as there are cores).
@@ -84,7 +84,7 @@ def main() -> None:
     print(f"{JOBS} jobs of {options.epochs} epochs on {len(os.sched_getaffinity(0))} cores")
     print(f"side by side: {statistics.median(ratios):.2f} times as fast")
     print(f"launching: {statistics.median(costs):.2f} s a job")
-    print(f"collecting, without drawing predictions anew: {statistics.median(reports) / JOBS:.2f} s a job")
+    print(f"collecting, without drawing predictions again: {statistics.median(reports) / JOBS:.2f} s per job")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""What do metrics and further protocols cost beside the network itself?
+"""What do metrics and further protocols cost in addition to the network itself?
 
 Three questions, each answered by ratios of times taken in turns in one process:
 
 1. One pass over a test set under all six protocols, against one protocol that needs the same forward passes
    (``eigen_flip``), with the trivial baselines and without, depth edges and strata aside.
-2. All metrics of one protocol on a 480 x 640 truth, SSIM and resizing included, against the network's forward pass
+2. All metrics of one protocol on a 480 x 640 ground truth, SSIM and resizing included, vs the network's forward pass
    at 224 x 224.
 3. The boundary metrics, against the same.
 
@@ -82,7 +82,7 @@ def timed(work: Callable[[], object], repeats: int) -> Callable[[], float]:
 
 @torch.inference_mode()
 def metric_costs(data: DepthDataModule, net: nn.Module, pairs: int) -> None:
-    """Print what scoring one image costs beside predicting it."""
+    """Print what scoring one image costs in addition to predicting it."""
     dataset = StoreDataset(data.store, data.split.test[:1], native=True)
     batch = preprocess(dataset[0], max_depth_m=data.max_depth_m)
     assert batch["native_depth"][0].shape[-2:] == (480, 640)

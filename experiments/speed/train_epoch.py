@@ -1,4 +1,4 @@
-"""What does an epoch cost beside forward, backward and step?
+"""What does an epoch cost in addition to forward, backward and step?
 
 Trains the same network in turns: in a bare PyTorch loop over batches that lie in memory, and as hudepth-train does,
 with everything that an epoch has (store, augmentation, averaged weights, logging, history, finite-loss check,

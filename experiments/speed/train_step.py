@@ -3,7 +3,7 @@
 Trains steps on a batch in memory (BADCL, AdamW), each variant in turns with the first: the plain network in float32,
 channels-last, merged arithmetic, bfloat16, kept memory, a frozen stem, smaller images, recomputed activations. Prints
 milliseconds and, for each variant, the median of the paired ratios of images per second. Each runs in a process of its
-own, since memory that was kept once stays so. With --profile: the operations that take the most time, before and after.
+own, since kept memory cannot be given back. With --profile: the operations that take the most time, before and after.
 
     python experiments/speed/train_step.py [--batch 8] [--rounds 5] [--steps 3] [--profile]
 """
@@ -53,7 +53,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def serve(batch: int) -> None:
-    """Be one variant: read options, then run as many steps as each further line says, and answer with their seconds."""
+    """Serve one variant: read options, then run as many steps as each line asks for, and print their seconds."""
     import torch
 
     from hudepth.base.machine import keep_freed_memory

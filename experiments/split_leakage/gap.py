@@ -6,7 +6,7 @@ the second never saw them, with everything else equal.
 
     python experiments/split_leakage/gap.py <run, random split> <run, disjoint split> <name of the table>
 
-writes the table between the markers of README.md beside this file, and <name>.json with the figures.
+writes the table between the markers of README.md in this folder, and <name>.json with the figures.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """When does each run first reach the best validation abs_rel of the paper's recipe? From the runs' own histories.
 
-python -m experiments.time_to_accuracy.table [<run of the paper's recipe> <run of experiment/strong> [<text to cut>]]
+    python -m experiments.time_to_accuracy.table [<run of badcl> <run of strong> [<text to cut>]]
 
-With two runs, their histories are copied here first.
+Given two runs, it copies their histories here first.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Write the labelled set in DenseDepth's layout: JPEG images beside 8-bit depth, value / 255 * 10 m.
+"""Write the labelled set in DenseDepth's layout: JPEG images and 8-bit depth, value / 255 * 10 m.
 
-The paper's 50,688 frames come in this form, so ``data=densedepth`` reads the result as it reads those, rightly or as
+The paper's 50,688 frames come in this form, so ``data=densedepth`` reads the result the same way, correctly or as
 millimetres.
 
     python experiments/units/as_densedepth.py <nyu_labeled> <folder to write>

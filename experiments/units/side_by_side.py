@@ -1,8 +1,8 @@
-"""The same recipe on the same 8-bit depth, read rightly and read as millimetres, beside the paper's figures.
+"""The same recipe on the same 8-bit depth, read correctly and as millimetres, next to the paper's figures.
 
     python experiments/units/side_by_side.py <run, uint8_10m> <run, paper_literal>
 
-writes the table between the markers of README.md beside this file. The loss is that of the last epoch; the metrics are
+writes the table between the markers of README.md in this folder. The loss is that of the last epoch; the metrics are
 those of the best checkpoint on its own test images, at network resolution, in metres as read.
 """
 

@@ -39,19 +39,19 @@ BACKENDS = {
         _TORCH, "the merged network through torch.compile, once per batch size", options={**_MERGED, "compile": True}
     ),
     "onnxruntime": Backend(
-        f"{_GRAPH}:OnnxRunner", "the merged network, exported to ONNX",
+        f"{_GRAPH}:onnxruntime", "the merged network, exported to ONNX",
         packages=("onnxruntime", "onnx", "onnxscript"), extras="onnx", graph=ONNX,
     ),
     "openvino": Backend(
-        f"{_GRAPH}:OpenVinoRunner", "the same file in OpenVINO, float32",
+        f"{_GRAPH}:openvino", "the same file in OpenVINO, float32",
         packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "float32"},
     ),
     "openvino_bf16": Backend(
-        f"{_GRAPH}:OpenVinoRunner", "the same file in OpenVINO, bfloat16: not exact",
+        f"{_GRAPH}:openvino", "the same file in OpenVINO, bfloat16: not exact",
         packages=_OPENVINO, extras="onnx,openvino", graph=ONNX, options={"precision": "bfloat16"},
     ),
     "int8": Backend(
-        f"{_GRAPH}:OpenVinoRunner", "OpenVINO, quantised on a few built-in rooms: measures speed, not accuracy",
+        f"{_GRAPH}:openvino", "OpenVINO, quantised on a few built-in rooms: measures speed, not accuracy",
         packages=(*_OPENVINO, "nncf"), extras="onnx,openvino", graph=INT8, options={"precision": "float32"},
     ),
 }  # fmt: skip

@@ -73,7 +73,7 @@ def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda
                 pass
     measured = Measured(plan, subject, contenders.entries, session, rates)
     if not session.samples:
-        raise ConfigError(f"nothing could be measured. {' '.join(measured.notes)}")
+        raise ConfigError(f"nothing could be measured. {' '.join(session.notes)}")
     return measured
 
 

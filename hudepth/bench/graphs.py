@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,54 +20,44 @@ from hudepth.inference.runtimes import onnx_session, openvino_model
 
 
 class GraphRunner(Runner):
-    """Runs a graph on the CPU. This one is only made for the sake of making the graph, and runs nothing."""
+    """Runs a graph on the CPU, with the options that hudepth-predict uses.
+
+    Args:
+        compute: images [b, 3, h, w] to unit depth [b, 1, h, w].
+    """
+
+    def __init__(self, compute: Callable[[NDArray[np.float32]], Any]) -> None:
+        self._compute = compute
 
     def load(self, images: NDArray[np.float32]) -> None:
         """Set the batch of all following passes."""
         self._images = np.ascontiguousarray(images)
 
+    def run(self) -> None:
+        """Compute one pass."""
+        self._result = self._compute(self._images)
+
     def result(self) -> NDArray[np.float32]:
         """Return unit depth [b, 1, h, w]."""
         return np.asarray(self._result)
 
-    def run(self) -> None:
-        """Compute one pass."""
-        self._result: Any = np.zeros(0, np.float32)
 
-
-class OnnxRunner(GraphRunner):
-    """ONNX Runtime on the CPU, with the options that hudepth-predict uses.
+def onnxruntime(spec: Spec) -> GraphRunner:
+    """Run the ONNX file ``graph`` in ONNX Runtime.
 
     Its threads spin for some 20 ms after a pass, which slows the next contender's untimed pass; without spinning, a
     pass is slower.
-
-    Args:
-        spec: with the option ``graph``, an ONNX file.
     """
-
-    def __init__(self, spec: Spec) -> None:
-        self._session = onnx_session(Path(spec.options["graph"]), threads=spec.threads)
-        self._input = self._session.get_inputs()[0].name
-
-    def run(self) -> None:
-        """Compute one pass."""
-        (self._result,) = self._session.run(None, {self._input: self._images})
+    session = onnx_session(Path(spec.options["graph"]), threads=spec.threads)
+    name = session.get_inputs()[0].name
+    return GraphRunner(lambda images: session.run(None, {name: images})[0])
 
 
-class OpenVinoRunner(GraphRunner):
-    """OpenVINO on the CPU, with the options that hudepth-predict uses.
-
-    Args:
-        spec: with the options ``graph``, an ONNX or IR file, and ``precision``.
-    """
-
-    def __init__(self, spec: Spec) -> None:
-        graph, precision = Path(spec.options["graph"]), spec.options["precision"]
-        _, self._request = openvino_model(graph, threads=spec.threads, precision=precision)
-
-    def run(self) -> None:
-        """Compute one pass."""
-        self._result = np.array(self._request.infer({0: self._images}, share_inputs=True)[0])
+def openvino(spec: Spec) -> GraphRunner:
+    """Run the ONNX or IR file ``graph`` in OpenVINO, in ``precision``."""
+    graph, precision = Path(spec.options["graph"]), spec.options["precision"]
+    _, request = openvino_model(graph, threads=spec.threads, precision=precision)
+    return GraphRunner(lambda images: np.array(request.infer({0: images}, share_inputs=True)[0]))
 
 
 def export(spec: Spec) -> GraphRunner:
@@ -86,7 +77,7 @@ def export(spec: Spec) -> GraphRunner:
         parameters=parameters(net, trainable_only=False), epoch=0, processing=False,
     )  # fmt: skip
     export_onnx(net, Path(options["graph"]), info=info)
-    return GraphRunner()
+    return GraphRunner(np.asarray)
 
 
 def quantise(spec: Spec) -> GraphRunner:
@@ -96,13 +87,13 @@ def quantise(spec: Spec) -> GraphRunner:
         spec: with the options ``onnx`` (a graph of normalised images) and ``graph`` (``.xml`` to write).
     """
     os.environ["CI"] = "true"  # in this process: stops NNCF from collecting statistics
-    openvino: Any = importlib.import_module("openvino")
+    library: Any = importlib.import_module("openvino")
     nncf: Any = importlib.import_module("nncf")
     nncf.set_log_level(logging.ERROR)
     images = np.load(spec.images)
     quantised = nncf.quantize(
-        openvino.Core().read_model(spec.options["onnx"]), nncf.Dataset([image[None] for image in images]),
+        library.Core().read_model(spec.options["onnx"]), nncf.Dataset([image[None] for image in images]),
         preset=nncf.QuantizationPreset.MIXED, subset_size=len(images),
     )  # fmt: skip
-    openvino.save_model(quantised, spec.options["graph"], compress_to_fp16=False)
-    return GraphRunner()
+    library.save_model(quantised, spec.options["graph"], compress_to_fp16=False)
+    return GraphRunner(np.asarray)

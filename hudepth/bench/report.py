@@ -43,11 +43,6 @@ class Measured:
         """The best rate; None if it was not measured."""
         return max(self.rates, default=None)
 
-    @property
-    def notes(self) -> list[str]:
-        """What was left out, and why."""
-        return [f"{name}: {line}" for name, lines in self.session.notes.items() for line in lines]
-
     def rows(self) -> list[Row]:
         """Return the rows of the table."""
         return make_rows(
@@ -69,7 +64,7 @@ def write_report(measured: Measured, *, sentences: Sequence[str] = ()) -> None:
     plan, subject, rows = measured.plan, measured.subject, measured.rows()
     best = describe_efficiency(rows, peak_gflop_per_s=measured.peak_gflop_per_s, merged_flops=subject.merged_flops)
     lines = [*([best] if best else []), *sentences]
-    notes = [*_about(measured), *measured.notes]
+    notes = [*_about(measured), *measured.session.notes]
     machine = hardware() | ({"gpu": torch.cuda.get_device_name()} if plan.device == "cuda" else {})
     height, width = subject.size
     table = bench_table(rows, f"{subject.name}, {height} x {width}, threads: {plan.threads}")

@@ -47,8 +47,8 @@ class Session:
     before_round: Callable[[], None] = lambda: None
     """Measures the machine as often as the contenders are measured."""
     samples: list[Sample] = field(default_factory=list)
-    notes: dict[str, list[str]] = field(default_factory=dict)
-    """By contender."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out, and why."""
 
     @property
     def steps(self) -> int:
@@ -80,7 +80,7 @@ class Session:
     def note(self, name: str, line: str) -> None:
         """Log a line about a contender, and keep it."""
         log.warning("%s: %s", name, line)
-        self.notes.setdefault(name, []).append(line)
+        self.notes.append(f"{name}: {line}")
 
     def _fits(self, contender: Worker, batch: int) -> bool:
         before = [sample for sample in self.samples if sample.name == contender.name]

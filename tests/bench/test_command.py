@@ -64,7 +64,7 @@ def test_a_checkpoint_is_measured_whatever_fails_beside_it(
     trained: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken = backends.Backend("hudepth.bench.torch_runners:absent", "broken")
-    gone = backends.Backend("hudepth.bench.graphs:OnnxRunner", "gone", packages=("absent",), extras="onnx")
+    gone = backends.Backend("hudepth.bench.graphs:onnxruntime", "gone", packages=("absent",), extras="onnx")
     monkeypatch.setitem(backends.BACKENDS, "compile", broken)
     monkeypatch.setitem(backends.BACKENDS, "onnxruntime", gone)
     arguments = ("backends=[compile,onnxruntime]", "batches=1", "repeats=1", "seconds=0")

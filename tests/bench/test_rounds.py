@@ -71,7 +71,7 @@ def test_the_machine_is_measured_as_often_as_the_contenders() -> None:
 def test_one_that_fails_is_a_note_and_the_rest_is_done(what: str, kept: list[int]) -> None:
     calls: CALLS = []
     session = measured(Fake("a", calls), Fake("b", calls, fails=(what, 2)), Fake("c", calls), batches=(1, 2, 4))
-    assert session.notes == {"b": ["failed at batch 2: it broke"]}
+    assert session.notes == ["b: failed at batch 2: it broke"]
     found = {name: [sample.batch for sample in session.samples if sample.name == name] for name in "abc"}
     assert found == {"a": [1, 2, 4], "b": [1, *kept], "c": [1, 2, 4]}
     assert all(len(sample.rounds) == 3 for sample in session.samples)
@@ -81,6 +81,6 @@ def test_one_that_fails_is_a_note_and_the_rest_is_done(what: str, kept: list[int
 def test_passes_that_would_take_too_long_are_left_out() -> None:
     calls: CALLS = []
     session = measured(Fake("slow", calls, image_s=4.0), Fake("fast", calls), batches=(1, 2, 4))
-    assert session.notes == {"slow": ["not measured at batch 4, where a pass would take about 16 s"]}
+    assert session.notes == ["slow: not measured at batch 4, where a pass would take about 16 s"]
     assert [sample.batch for sample in session.samples if sample.name == "fast"] == [1, 2, 4]
     assert [sample.batch for sample in session.samples if sample.name == "slow"] == [1, 2]
