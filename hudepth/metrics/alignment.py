@@ -1,12 +1,12 @@
-"""Bringing a prediction onto the scale of its truth, image by image, before it is scored.
+"""Aligns predictions with their ground truth, image by image, before scoring.
 
-With p the prediction and t the truth at the valid pixels of one image:
+With p the prediction and t the ground truth at the valid pixels of one image:
 
     median          p * median(t) / median(p)                          Zhou et al. 2017
     least_squares   s p + o,  s and o minimise sum (s p + o - t)^2     Ke et al. 2024 (Marigold)
     affine_inverse  1 / (s / p + o),  s and o minimise sum (s / p + o - 1 / t)^2    Ranftl et al. 2022 (MiDaS)
 
-An aligned score says how well a shape is predicted, not how many metres: it never stands beside an unaligned one.
+An aligned score rates the predicted shape, not its scale in metres: never compare it with an unaligned one.
 """
 
 from __future__ import annotations
@@ -20,19 +20,18 @@ from hudepth.base.errors import ConfigError, did_you_mean
 ALIGNMENTS = ("none", "median", "least_squares", "affine_inverse")
 
 MAX_DEPTH_M = 1e3
-"""Where ``affine_inverse`` would answer beyond this, or behind the camera, it answers this [m]."""
+"""Results of ``affine_inverse`` beyond this, or behind the camera, become this [m]."""
 _MIN_DEPTH_M = 1e-3
 
 
 def align(
     pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"], *, kind: str
 ) -> Float[Tensor, "b 1 h w"]:
-    """Return the predictions, each aligned to its truth over its valid pixels.
+    """Return the predictions, each aligned with its ground truth over its valid pixels.
 
-    An image without a valid pixel is returned as it is. A prediction that is constant where valid has no scale to
-    fit: it is shifted. A median of 0 or less cannot be scaled and is returned as it is. A NaN or infinite prediction
-    at a valid pixel stays one, and may spread over its image: a fit to it means nothing. ``least_squares`` may answer
-    0 m and less.
+    An image without a valid pixel is returned unchanged, as is one with a median of 0 or less. A prediction that is
+    constant where valid has no scale to fit: it is shifted. A NaN or infinite prediction at a valid pixel may spread
+    over its image. ``least_squares`` may return 0 m and less.
 
     Args:
         pred_m: predicted depth [m].

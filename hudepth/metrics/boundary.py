@@ -1,26 +1,24 @@
 """How well depth edges are predicted: three published measures, per image.
 
-``edge_*``: Hu et al. 2019 ("Revisiting Single Image Depth Estimation", WACV): pixels of steep depth, prediction
-    against truth, at three thresholds.
+``edge_*``: Hu et al. 2019 ("Revisiting Single Image Depth Estimation", WACV): pixels of steep depth, at three
+    thresholds.
 ``si_boundary_f1``: Bochkovskii et al. 2024 ("Depth Pro", arXiv 2410.02073, section 3.2): which of two neighbours is
-    nearer, by depth ratio; the scale of the prediction does not matter.
-``dbe_*_px``: Koch et al. 2018 (iBims-1, arXiv 1805.01328): how far edges of prediction and truth lie apart.
+    nearer, by depth ratio; independent of the prediction's scale.
+``dbe_*_px``: Koch et al. 2018 (iBims-1, arXiv 1805.01328): distance between predicted and true edges.
 
-A measure is NaN where the truth has no edge, and 0 (the largest, if a distance) where only the prediction has none. So
-the truth alone decides which images count, and two predictions are averaged over the same ones. All measures depend
-on the resolution, and on that of depth itself: truth in coarse levels has steps where the scene has none.
+A measure is NaN if the ground truth has no edge, and 0 (the largest, for a distance) if only the prediction has none.
+So the ground truth alone decides which images count. All measures depend on the resolution of the image and of depth
+itself: coarsely quantised ground truth has steps where the scene has none.
 """
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hudepth.base.masked import full_precision
+from hudepth.metrics.canny import canny_edges, chamfer_px
 from hudepth.metrics.depth import MIN_DEPTH_M
 
 EDGE_THRESHOLDS = (0.25, 0.5, 1)
@@ -32,8 +30,6 @@ BOUNDARY_NAMES = (
 )  # fmt: skip
 """Keys of :func:`boundary_metrics`."""
 
-_CANNY_SCALE = 8000  # unit depth in int16: its Sobel response is at most 4 * 8000 < 2^15
-
 
 def boundary_metrics(
     pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
@@ -43,10 +39,10 @@ def boundary_metrics(
     Args:
         pred_m: predicted depth [m], finite where valid.
         target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: True where the truth is measured.
+        valid: True where the ground truth is measured.
 
     Returns:
-        The measures named in :data:`BOUNDARY_NAMES`, in that order; NaN where the truth has no such edge.
+        The measures named in :data:`BOUNDARY_NAMES`, in that order; NaN where the ground truth has no such edge.
     """
     slopes = _squared_slopes(pred_m, target_m, valid)
     values: dict[str, Tensor] = {}
@@ -70,17 +66,16 @@ def edge_scores(
     An edge pixel is one where sqrt(fx^2 + fy^2) > threshold, fx and fy the plain 3 x 3 Sobel sums of depth in
     metres (weights 1 2 1, not divided by 8): a step of s metres along an axis gives 4 s, so the thresholds 0.25, 0.5
     and 1 find steps above 6, 12.5 and 25 cm. Only pixels whose whole 3 x 3 window lies in the image and is valid
-    count; the authors' code pads with zeros, so that the image's frame is an edge in truth and prediction alike.
+    count; the authors' code pads with zeros, which makes the image's border an edge in both maps.
 
     Args:
-        pred_m: predicted depth [m].
-        target_m: ground-truth depth [m]; ignored where not valid.
-        valid: True where the truth is measured.
+        pred_m: as in :func:`boundary_metrics`, like ``target_m`` and ``valid``.
+        target_m: see there.
+        valid: see there.
         threshold: the Sobel magnitude [m] above which a pixel is an edge.
 
     Returns:
-        ``precision``, ``recall`` and ``f1`` = 2 hits / (predicted + true), in [0, 1]. All are 0 if the truth has edges
-        and the prediction none, and NaN if the truth has none.
+        ``precision``, ``recall`` and ``f1`` = 2 hits / (predicted + true), in [0, 1].
     """
     return _edge_scores(*_squared_slopes(pred_m, target_m, valid), threshold)
 
@@ -100,23 +95,22 @@ def si_boundary_f1(
     each t, precision and recall of the occlusions of each direction are averaged over the directions, F1 is their
     harmonic mean (0 if both are 0), and the result is the mean of F1 over ``steps`` evenly spaced t, weighted with t.
     Pairs with an invalid pixel do not count; a prediction below :data:`~hudepth.metrics.depth.MIN_DEPTH_M` counts as
-    that. Only there does the scale of the prediction matter.
+    that.
 
-    The authors' code scores 0 for a direction or a threshold without any occlusion, so that even the truth itself
-    can stay below 1. Here a direction counts for recall where the truth has occlusions, for precision where either
-    has, and a threshold counts where the truth has. Where the truth has all directions at all thresholds,
-    both give the same number.
+    The authors' code scores 0 for a direction or threshold without any occlusion, so that even the ground truth can
+    score below 1. Here a direction counts for recall if the ground truth has occlusions, for precision if either has,
+    and a threshold counts if the ground truth has. With all directions at all thresholds both agree.
 
     Args:
-        pred_m: predicted depth [m], up to a factor; finite where valid.
-        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: True where the truth is measured.
+        pred_m: as in :func:`boundary_metrics`, but only up to a factor.
+        target_m: see there.
+        valid: see there.
         min_ratio: least threshold, at least 1.
         max_ratio: largest threshold.
         steps: how many thresholds.
 
     Returns:
-        Values in [0, 1]; NaN if the truth has no occlusion at ``min_ratio``.
+        Values in [0, 1].
     """
     ratios = torch.linspace(min_ratio, max_ratio, steps, dtype=torch.float64, device=pred_m.device)
     pred, target = (torch.where(valid, full_precision(x).clamp_min(MIN_DEPTH_M), 1.0) for x in (pred_m, target_m))
@@ -126,8 +120,7 @@ def si_boundary_f1(
     precision = _mean_where(true + predicted > 0, hits / predicted.clamp_min(1), dim=1)
     f1 = (2 * precision * recall / (precision + recall)).nan_to_num()
     weights: Tensor = ratios * (true.sum(dim=1) > 0)
-    mean: Tensor = (weights * f1).sum(dim=1) / weights.sum(dim=1)
-    return mean
+    return (weights * f1).sum(dim=1) / weights.sum(dim=1)
 
 
 def depth_boundary_errors(
@@ -149,23 +142,22 @@ def depth_boundary_errors(
 
     Edges are those of Canny's detector with the benchmark's settings: depth scaled to [0, 1] by its own least and
     largest valid value, a Gaussian of ``sigma_px``, thresholds on the plain 3 x 3 Sobel magnitude. The benchmark
-    compares with annotated occlusions; here the true edges are those the same detector finds in the true depth.
+    compares with annotated occlusions; here the same detector finds the true edges in the ground truth.
 
     Invalid pixels have no weight in the Gaussian, and no gradient is taken across them. Edges within 2 pixels of one
-    are dropped: there the detector cannot tell an edge from the end of what was measured.
+    are dropped: they may be ends of the measured area.
 
     Args:
-        pred_m: predicted depth [m], finite where valid.
-        target_m: ground-truth depth [m]; ignored where not valid.
-        valid: True where the truth is measured.
+        pred_m: as in :func:`boundary_metrics`, like ``target_m`` and ``valid``.
+        target_m: see there.
+        valid: see there.
         sigma_px: standard deviation of the Gaussian.
         low: Sobel magnitude, of depth in [0, 1], down to which an edge is followed.
         high: Sobel magnitude above which an edge begins.
         reach_px: distance from which an edge counts as missed.
 
     Returns:
-        ``acc_px`` in [0, reach_px] and ``comp_px`` in [0, reach_px]; NaN if the truth has no edge. They live where
-        ``pred_m`` does, though computed on the CPU.
+        ``acc_px`` and ``comp_px`` in [0, reach_px], on ``pred_m``'s device, though computed on the CPU.
     """
     rows = []
     maps = (x.detach().squeeze(1).float().cpu().numpy() for x in (pred_m, target_m))
@@ -213,7 +205,7 @@ def _occlusions(
     size = valid.shape[dim] - 1
     pairs = [(x.narrow(dim, 0, size), x.narrow(dim, 1, size)) for x in (pred, target, valid)]
     steep = [torch.maximum(a, b) / torch.minimum(a, b) for a, b in pairs[:2]]
-    # few neighbours differ by the least ratio: only those are looked at more closely
+    # few neighbours differ by the least ratio: only those are compared
     kept = (pairs[2][0] & pairs[2][1]) & (torch.maximum(*steep) > ratios[0].item())
     at = kept.flatten().nonzero()[:, 0]
     image = at // kept[0].numel()
@@ -231,42 +223,3 @@ def _occlusions(
 
 def _mean_where(mask: Tensor, x: Tensor, *, dim: int) -> Tensor:
     return torch.where(mask, x, 0.0).sum(dim=dim) / mask.sum(dim=dim)
-
-
-def canny_edges(
-    depth: NDArray[np.float32], valid: NDArray[np.bool_], *, sigma_px: float, low: float, high: float
-) -> NDArray[np.bool_]:
-    """Edge pixels of a depth map [h, w], as :func:`depth_boundary_errors` says. Invalid pixels may hold anything."""
-    if not valid.any():
-        return np.zeros_like(valid)
-    least, largest = depth.min(where=valid, initial=np.inf), depth.max(where=valid, initial=-np.inf)
-    measured = valid.astype(np.float32)
-    unit = (np.where(valid, depth, least) - least) / max(largest - least, np.finfo(np.float32).tiny)
-    smooth, weight = (cv2.GaussianBlur(x, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) for x in (unit, measured))
-    levels = np.rint(smooth * _CANNY_SCALE / np.maximum(weight, 1e-6)).astype(np.int16)
-    window = np.ones((3, 3), np.uint8)
-    whole = cv2.erode(valid.astype(np.uint8), window)
-    across, down = (cv2.Sobel(levels, cv2.CV_16S, *axes) * whole for axes in ((1, 0), (0, 1)))
-    edges = cv2.Canny(across, down, low * _CANNY_SCALE, high * _CANNY_SCALE, L2gradient=True)
-    # a gradient cut off at the mask has a maximum there, which is no edge
-    return np.asarray((edges > 0) & (cv2.erode(whole, window) > 0))
-
-
-def chamfer_px(pred: NDArray[np.bool_], target: NDArray[np.bool_], *, reach_px: float) -> tuple[float, float]:
-    """acc_px and comp_px of :func:`depth_boundary_errors` between two edge maps [h, w]."""
-    if not target.any():
-        return np.nan, np.nan
-    if not pred.any():
-        return reach_px, reach_px
-    to_target, to_pred = _nearest_px(pred, target), _nearest_px(target, pred)
-    near = to_target[to_target < reach_px]
-    accuracy = near.mean() if near.size else reach_px
-    apart = np.minimum(np.concatenate([to_target, to_pred]), reach_px)
-    return float(accuracy), float(apart.mean())
-
-
-def _nearest_px(edges: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Distance of each edge pixel to the nearest of the others."""
-    distances = cv2.distanceTransform((~others).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # squared distances are whole numbers; OpenCV's last bit depends on where the array lies in memory
-    return np.sqrt(np.rint(np.square(distances[edges].astype(np.float64))))

@@ -1,6 +1,6 @@
-"""Depth metrics of the field, in metres, over valid pixels.
+"""Standard depth metrics, in metres, over valid pixels.
 
-With p the prediction, t the truth, N the valid pixels, d = p - t and g = ln p - ln t:
+With p the prediction, t the ground truth, N the valid pixels, d = p - t and g = ln p - ln t:
 
     abs_rel  = 1/N sum |d| / t           (the paper's ARE)
     sq_rel   = 1/N sum d^2 / t           [m]
@@ -15,7 +15,7 @@ With p the prediction, t the truth, N the valid pixels, d = p - t and g = ln p -
 Sources: Turkmen and Akgun 2025, section 3.5 (abs_rel, mse, log10, delta); Eigen et al. 2014 (sq_rel, rmse,
 rmse_log, and silog's radicand; most report silog with lambda 1 and factor 100). In g, log10 and delta a
 prediction below :data:`MIN_DEPTH_M` counts as that. All metrics follow from sums over pixels, so the same
-formulas serve one image and pixels pooled over many.
+formulas apply to one image and to pixels pooled over many.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ METRIC_NAMES = depth_names()
 
 
 class DepthMaps(NamedTuple):
-    """What the sums are made of, pixel by pixel: any number of crops and masks can be summed from one computation."""
+    """Terms of the sums at each pixel: computed once, summed over any number of crops and masks."""
 
     maps: Float[Tensor, "k b 1 h w"]
     """The terms named in :data:`SUM_NAMES` after the count. Where not valid, errors are 0 and deltas 1."""
@@ -69,7 +69,7 @@ class DepthMaps(NamedTuple):
         count = valid.flatten(1).sum(dim=1)
         if masked:
             totals = maps.sum(dim=(-3, -2, -1)).double()
-            totals[-len(DELTAS) :] -= valid[0].numel() - count  # what is not valid was counted
+            totals[-len(DELTAS) :] -= valid[0].numel() - count  # invalid pixels were counted
         else:
             totals = (maps * valid).sum(dim=(-3, -2, -1)).double()
             if not bool(totals.isfinite().all()):  # 0 times NaN is NaN
@@ -85,12 +85,12 @@ class DepthMaps(NamedTuple):
 def depth_maps(
     pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
 ) -> DepthMaps:
-    """Compute what the metrics are made of at each pixel.
+    """Compute the terms of the metrics at each pixel.
 
     Args:
         pred_m: predicted depth [m].
         target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: True where the truth is measured.
+        valid: True where the ground truth is measured.
 
     Returns:
         Maps in float32 (float64 for float64).
@@ -122,12 +122,12 @@ def depth_maps(
 def depth_sums(
     pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
 ) -> dict[str, Float64[Tensor, " b"]]:
-    """Sum, over each image's valid pixels, what the metrics are made of.
+    """Sum the terms of the metrics over each image's valid pixels.
 
     Args:
         pred_m: predicted depth [m].
         target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: True where the truth is measured.
+        valid: True where the ground truth is measured.
 
     Returns:
         The sums named in :data:`SUM_NAMES`: of :func:`depth_maps`, in float64.

@@ -77,7 +77,7 @@ def ssim(
 ) -> Float[Tensor, " b"]:
     """Mean of :func:`ssim_map` over the windows whose pixels are all valid; NaN for an image without one.
 
-    Arguments and errors are those of :func:`ssim_map`; ``valid``: where the truth is measured (None: all).
+    Arguments and errors are those of :func:`ssim_map`; ``valid``: where the ground truth is measured (None: all).
     """
     if valid is None:
         valid = torch.ones_like(target, dtype=torch.bool)
@@ -98,7 +98,7 @@ def ssim_sums(
 ) -> tuple[Float64[Tensor, " b"], Int64[Tensor, " b"]]:
     """Sum of :func:`ssim_map` over each image's windows whose pixels are all valid, and how many there are.
 
-    Arguments and errors are those of :func:`ssim_map`; ``valid`` is True where the truth is measured.
+    Arguments and errors are those of :func:`ssim_map`; ``valid`` is True where the ground truth is measured.
     """
     pred, target = torch.where(valid, pred, 0.0), torch.where(valid, target, 0.0)
     values = ssim_map(pred, target, data_range=data_range, window=window, sigma=sigma, k1=k1, k2=k2)

@@ -23,9 +23,9 @@ from hudepth.base.masked import full_precision
 from hudepth.metrics.depth import DELTAS, MIN_DEPTH_M
 
 DEPTH_EDGES_M = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
-"""Between bins of true depth; a depth on an edge lies in the farther bin."""
+"""Between bins of ground-truth depth; a depth on an edge belongs to the farther bin."""
 EDGE_DISTANCES_PX = (2.0, 5.0, 10.0, 20.0, 40.0)
-"""Between bins of distance to the nearest depth edge, in pixels of the truth that is scored."""
+"""Between bins of distance to the nearest depth edge, in pixels of the scored ground truth."""
 EDGE_RATIO = 1.1
 """Two neighbours form a depth edge where one is over this many times as far as the other."""
 _SIDES = (("top", "middle", "bottom"), ("left", "centre", "right"))
@@ -53,7 +53,7 @@ _CELLS = math.prod(_SIZES)
 
 @dataclass(frozen=True)
 class Stratum:
-    """What a network reaches on a part of the pixels."""
+    """Metrics of a network on a part of the pixels."""
 
     group: str
     label: str
@@ -139,11 +139,11 @@ def summarise_strata(sums: Float64[Tensor, "n bins 5"], categories: Sequence[str
     """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels.
 
     Args:
-        sums: of :func:`strata_sums`, a row an image.
+        sums: of :func:`strata_sums`, one row per image.
         categories: kind of scene of each image, empty where unknown.
 
     Returns:
-        Bins without a pixel are left out. The group ``category`` stands last, if any category is known: at most
+        Bins without a pixel are left out. The group ``category`` comes last, if any category is known: at most
         :data:`MAX_CATEGORIES`, most pixels first, the rest as ``other``.
     """
     rows = [(*STRATA[i], sums[:, i]) for i in range(len(STRATA))]

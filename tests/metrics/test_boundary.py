@@ -16,12 +16,11 @@ from torch import Tensor
 from hudepth.metrics.boundary import (
     BOUNDARY_NAMES,
     boundary_metrics,
-    canny_edges,
-    chamfer_px,
     depth_boundary_errors,
     edge_scores,
     si_boundary_f1,
 )
+from hudepth.metrics.canny import canny_edges, chamfer_px
 
 PUBLISHED_CANNY = {"sigma_px": 2**0.5, "low": 0.15, "high": 0.3}
 RATIOS = np.linspace(1.05, 1.25, 10)
