@@ -67,15 +67,10 @@ def resolve_encoding(
 
 
 def to_metres(
-    raw: NDArray[np.generic],
-    encoding: str,
-    *,
-    scale_m: float | None = None,
-    offset: float = 0.0,
-    auto_uint8: str | None = None,
-    where: str = "",
-) -> NDArray[np.float32]:
-    """Convert stored depth values to metres.
+    raw: NDArray[np.generic], encoding: str, *, scale_m: float | None = None, offset: float = 0.0,
+    auto_uint8: str | None = None, where: str = "",
+) -> NDArray[np.float32]:  # fmt: skip
+    """Convert stored depth values to float32 metres [H, W], 0 where unmeasured.
 
     ============== ============================== =========================================
     encoding       stored values                  depth [m]
@@ -98,9 +93,6 @@ def to_metres(
         offset: in units of the stored value, for ``linear``.
         auto_uint8: see :func:`resolve_encoding`.
         where: names the file in errors.
-
-    Returns:
-        [H, W] float32 depth [m], 0 where unmeasured.
 
     Raises:
         ConfigError: if the encoding is unknown.
