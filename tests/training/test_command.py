@@ -54,8 +54,8 @@ def test_a_run_leaves_everything_the_contract_names(trained: Path) -> None:
     rows = history(trained)
     assert [row["epoch"] for row in rows] == ["1", "2"]
     for stage in ("train", "val"):
-        total = float(rows[1][f"{stage}/total"])
-        terms = [float(rows[1][f"{stage}/{term}"]) for term in ("boundary", "smoothness", "scaling")]
+        total = float(rows[1][f"{stage}/loss/total"])
+        terms = [float(rows[1][f"{stage}/loss/{term}"]) for term in ("boundary", "smoothness", "scaling")]
         assert total == pytest.approx(3.0 * terms[0] + 1.2 * terms[1] + 1.0 * terms[2], rel=1e-5)
 
 

@@ -137,8 +137,8 @@ def test_raw_terms_are_logged_apart_from_their_weights(cache: Path) -> None:
     trainer = make_trainer()
     trainer.fit(make_module(loss), datamodule=make_data(cache))
     for stage in ("train", "val"):
-        parts = sum(w * trainer.callback_metrics[f"{stage}/{name}"].item() for name, w in loss.weights.items())
-        assert trainer.callback_metrics[f"{stage}/total"].item() == pytest.approx(parts, rel=1e-5)
+        parts = sum(w * trainer.callback_metrics[f"{stage}/loss/{name}"].item() for name, w in loss.weights.items())
+        assert trainer.callback_metrics[f"{stage}/loss/total"].item() == pytest.approx(parts, rel=1e-5)
 
 
 def test_schedule_steps_once_an_epoch(cache: Path) -> None:
