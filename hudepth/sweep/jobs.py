@@ -25,7 +25,6 @@ class Job:
     """One job of a sweep; jobs compare by object identity."""
 
     overrides: tuple[str, ...]
-    """That run it alone."""
     labels: Mapping[str, str]
     """What was varied, as on the command line."""
     config: Mapping[str, Any] | None = None
@@ -109,12 +108,7 @@ def _key(override: Override) -> str:
 def compose(
     jobs: Iterable[Job], compose_one: Callable[[list[str]], dict[str, Any]], word: Callable[[Exception], str]
 ) -> list[Job]:
-    """Return the jobs with their configurations; one that does not compose gets the error.
-
-    Args:
-        jobs: to compose.
-        compose_one: turns overrides into a resolved configuration.
-        word: returns an error as one line.
+    """Return the jobs with their configurations from ``compose_one``, or with the error in one line from ``word``.
 
     Raises:
         ConfigError: if a job would be distributed over processes, or two jobs are the same training.
@@ -159,12 +153,7 @@ def _check_same(first: Job, config: Mapping[str, Any], job: Job) -> None:
 
 
 def find_done(jobs: Iterable[Job], folder: Path) -> list[Job]:
-    """Return the jobs with the run directories they already have, found by configuration and not by name.
-
-    Args:
-        jobs: composed.
-        folder: of the sweep; it need not exist.
-    """
+    """Return composed jobs with the run directories they already have, found by configuration and not by name."""
     known: dict[str, tuple[Path, dict[str, Any]]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         try:

@@ -48,13 +48,8 @@ class KeptCheckpoint(ModelCheckpoint):
 def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelCheckpoint]:
     """Return the callbacks that keep the best weights and the last state.
 
-    ``best.ckpt`` holds only weights; ``last.ckpt`` all that resuming needs. The last is saved last, so that it records
-    the best.
-
-    Args:
-        run: the run directory.
-        monitor: the metric that decides which epoch is best.
-        mode: ``min`` or ``max``.
+    ``best.ckpt`` of a run directory holds only weights, of the epoch that is best by ``monitor``; ``last.ckpt`` all
+    that resuming needs. The last is saved last, so that it records the best.
     """
     folder = run / CHECKPOINTS
     best = KeptCheckpoint(

@@ -51,8 +51,8 @@ def open_study(file: str, options: Mapping[str, Any] | None = None, *, direction
     """Open or create a study in a journal file, which many processes may write to and a kill cannot damage.
 
     Args:
-        file: its path.
-        options: of the search, to be stored in the study; None for those that are stored.
+        file: path of the journal.
+        options: of the search, stored in the study; None to use the stored ones.
         direction: ``minimize`` or ``maximize``.
 
     Raises:

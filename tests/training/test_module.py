@@ -210,7 +210,7 @@ def test_losses_not_yet_looked_at_are_checked_before_an_epoch_is_saved(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a GPU losses are looked at in lots; here the lot never gets full, as in a short epoch."""
-    monkeypatch.setattr("hudepth.training.module.LOTS", {"cpu": 50})
+    monkeypatch.setattr("hudepth.training.module.CHECK_EVERY", {"cpu": 50})
     keeper = ModelCheckpoint(tmp_path, "last", save_on_train_epoch_end=True, enable_version_counter=False)
     trainer = make_trainer(keeper, max_epochs=3)
     module = make_module(PoisonedLoss(good_calls=6, value=float("nan")))  # epoch 1: 3 training and 1 validation batch
