@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.options import plain
 from hudepth.base.verbs import SUBCOMMANDS, commands, module_of
 from hudepth.base.wording import LAUNCHERS, one_line
 
@@ -121,7 +122,9 @@ def _run_hydra(task: str) -> int:
         setup_logging()
         try:
             run: Callable[[Any], Any] = getattr(importlib.import_module(module_of(task)), task)
-            return run(cfg)
+            if task == "train":  # which resumes runs by what Hydra was given
+                return run(cfg)
+            return run({**plain(cfg), "overrides": list(HydraConfig.get().overrides.task)})
         except Exception as error:  # kept from Hydra, which would print it in its own way
             errors.append(error)
             return None

@@ -21,8 +21,8 @@ from experiments.ledger.runs import Run, find_runs
 from experiments.ledger.units import predictions, render_rooms, score_readings
 from hudepth.base.console import log, track
 from hudepth.base.errors import HudepthError
-from hudepth.base.files import write_json, write_text
-from hudepth.base.options import Range, convert, output_folder
+from hudepth.base.files import output_folder, write_json, write_text
+from hudepth.base.options import Range, convert
 from hudepth.runs.environment import environment
 
 ROOMS, ROOM_SIDE_PX = 24, 112

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from hudepth.base.errors import ConfigError
 
 
 @contextmanager
@@ -77,3 +80,18 @@ def read_yaml(path: Path) -> Any:
     """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     return yaml.load(path.read_text(encoding="utf-8"), Loader=loader)
+
+
+def output_folder(value: str | Path, *, key: str = "output") -> Path:
+    """Make a folder and try to write to it, before there is anything to lose.
+
+    Raises:
+        ConfigError: if that is not possible.
+    """
+    output = Path(str(value)).expanduser()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=output):
+            return output
+    except OSError as error:
+        raise ConfigError(f"{key}: cannot write to '{output}' ({error.strerror}). Pass {key}=<a folder>.") from error

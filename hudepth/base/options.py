@@ -1,23 +1,13 @@
 """Options, checked once: a dataclass states the type and range of each, and one wording serves every mistake.
 
-A command declares its options and parses its configuration before any work::
-
-    @dataclass(frozen=True)
-    class PredictOptions:
-        input: str
-        formats: list[Annotated[str, Choice(FORMATS)]] | None
-        size: Size | None
-        smoothing: Annotated[float, Range(0, 1, below=True)] = 0.0
-
-    options = parse(PredictOptions, config)
-
-A library class checks its arguments in the same words: :func:`check` for a dataclass, :func:`convert` for one value.
+A command declares its options, as ``smoothing: Annotated[float, Range(0, 1, below=True)] = 0.0``, and parses its
+configuration before any work. A library class checks its arguments in the same words: :func:`check` for a dataclass,
+:func:`convert` for one value.
 """
 
 from __future__ import annotations
 
 import math
-import tempfile
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -34,14 +24,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a number, both included unless ``above`` or ``below`` is set."""
+    """Bounds of a number; ``above`` excludes ``min`` itself, ``below`` excludes ``max``."""
 
     min: float = -math.inf
     max: float = math.inf
     above: bool = False
-    """Whether ``min`` itself is excluded."""
     below: bool = False
-    """Whether ``max`` itself is excluded."""
 
     def holds(self, value: float) -> bool:
         """Return whether a number lies within the bounds."""
@@ -143,21 +131,6 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     return {str(key): value for key, value in config.items()}
-
-
-def output_folder(value: str | Path, *, key: str = "output") -> Path:
-    """Make a folder and try to write to it, before there is anything to lose.
-
-    Raises:
-        ConfigError: if that is not possible.
-    """
-    output = Path(str(value)).expanduser()
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=output):
-            return output
-    except OSError as error:
-        raise ConfigError(f"{key}: cannot write to '{output}' ({error.strerror}). Pass {key}=<a folder>.") from error
 
 
 class _MismatchError(Exception):
@@ -271,36 +244,3 @@ def _default(field: Any) -> Any:
 def _hints(schema: Any) -> dict[str, Any]:
     hints = get_type_hints(schema, include_extras=True)
     return {field.name: hints[field.name] for field in fields(schema)}
-
-
-# Replaced by parse() and convert(); each goes with its last caller.
-
-
-def whole_number(config: Mapping[str, Any], key: str, *, default: int, least: int = 0) -> int:
-    """Return a count from a configuration.
-
-    Raises:
-        ConfigError: if it is not a whole number of at least ``least``.
-    """
-    number: int = convert(key, config.get(key, default), Annotated[int, Range(least)], default=default)
-    return number
-
-
-def size_option(value: Any) -> tuple[int, int] | None:
-    """Return ``size`` of a configuration, None where none is typed.
-
-    Raises:
-        ConfigError: if it is not [height, width].
-    """
-    size: tuple[int, int] | None = convert("size", value, Size | None)
-    return size
-
-
-def several(key: str, value: object, choices: Iterable[str]) -> list[str]:
-    """Return one or more named choices, each once.
-
-    Raises:
-        ConfigError: if there is no such choice, or none is given.
-    """
-    names: list[str] = convert(key, value, list[Annotated[str, Choice(tuple(choices))]])
-    return names

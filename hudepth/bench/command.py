@@ -11,7 +11,6 @@ import torch
 
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError
-from hudepth.base.options import plain
 from hudepth.bench.contenders import Contenders
 from hudepth.bench.plan import Plan, make_plan
 from hudepth.bench.report import Measured, write_report
@@ -20,16 +19,15 @@ from hudepth.bench.subject import make_subject
 from hudepth.bench.worker import ContenderError
 
 
-def bench(cfg: Any) -> None:
+def bench(config: dict[str, Any]) -> None:
     """Measure, print the table, write bench.json, bench.csv, bench.md and bench.png.
 
     Args:
-        cfg: composed from conf/bench.yaml and the command line.
+        config: conf/bench.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user; a backend that is missing or fails is a note instead.
     """
-    config = plain(cfg)
     plan = make_plan(config)
     measured = measure(plan, runs=config["paths"]["runs"])
     try:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.files import output_folder
 from hudepth.base.machine import torch_device, usable_cores
-from hudepth.base.options import Choice, Range, Size, output_folder, parse
+from hudepth.base.options import Choice, Range, Size, parse
 from hudepth.bench.backends import BACKENDS, REFERENCE
 
 SETTINGS = ("backends", "batches", "repeats", "seconds", "longest_pass", "threads", "device")

@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from omegaconf import DictConfig
-
 from hudepth.base.errors import DataError
-from hudepth.base.options import parse, plain
+from hudepth.base.options import parse
 from hudepth.base.tables import Table
 from hudepth.data.audit.run_audit import audit
 from hudepth.data.build import build_data
@@ -29,16 +27,15 @@ class DataOptions:
     trust: list[str]
 
 
-def data(cfg: DictConfig) -> None:
+def data(config: dict[str, Any]) -> None:
     """Run the verb ``prepare``, ``info`` or ``audit``.
 
     Args:
-        cfg: composed from conf/data.yaml and the command line.
+        config: conf/data.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user.
     """
-    config = plain(cfg)
     options = parse(DataOptions, config)
     datamodule = build_data(options.data, trust=options.trust)
     if options.verb == "audit":

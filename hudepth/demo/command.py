@@ -5,16 +5,15 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hudepth.base.camera import CameraOption, Intrinsics
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
 from hudepth.base.images import MAX_PIXELS
-from hudepth.base.options import Range, parse, plain
+from hudepth.base.options import Range, parse
 from hudepth.demo.answers import Limits, answer
 from hudepth.demo.server import free_port, serve
 from hudepth.inference.model import ModelOptions, load_model
@@ -31,16 +30,15 @@ class DemoOptions(ModelOptions):
     intrinsics: CameraOption | None = None
 
 
-def demo(cfg: DictConfig) -> None:
+def demo(config: dict[str, Any]) -> None:
     """Serve the page until Ctrl-C.
 
     Args:
-        cfg: the configuration; see :class:`DemoOptions`.
+        config: conf/demo.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user.
     """
-    config = plain(cfg)
     if importlib.util.find_spec("gradio") is None:
         raise ConfigError("gradio is not installed. Run pip install 'hudepth[demo]'.")
     options = parse(DemoOptions, {**config, "runs": config["paths"]["runs"]})

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
 from hudepth.base.console import log
-from hudepth.base.options import parse, plain
+from hudepth.base.options import parse
 from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.evaluation.test_data import open_data
 from hudepth.runs.checkpoint import load_checkpoint
@@ -31,23 +28,21 @@ class CommandOptions(ScoreOptions):
     """Folder to write to; by default ``test`` in the run directory, else next to the working directory."""
 
 
-def test(cfg: DictConfig) -> None:
+def test(config: dict[str, Any]) -> None:
     """Score a checkpoint and write ``test/<protocol>/`` of its run directory.
 
     Args:
-        cfg: conf/test.yaml with command-line overrides.
+        config: conf/test.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user.
     """
-    options = parse(CommandOptions, plain(cfg))
+    options = parse(CommandOptions, config)
     checkpoint = load_checkpoint(options.checkpoint, runs=options.paths["runs"])
     log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data.get("source"))
     # An untrusted checkpoint may choose what to read, but not where to write.
     overrides = {"cache": options.paths["cache"], **(options.data or {})}
-    datamodule, other_data = open_data(
-        checkpoint, overrides, typed=HydraConfig.get().overrides.task, trust=options.trust
-    )
+    datamodule, other_data = open_data(checkpoint, overrides, typed=config["overrides"], trust=options.trust)
     output = options.output or Path(f"test_{checkpoint.path.stem}")
     if options.output is None and checkpoint.run:
         output = checkpoint.run / (f"test_{datamodule.source.name}" if other_data else "test")

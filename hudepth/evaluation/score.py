@@ -13,8 +13,9 @@ from torch import nn
 from hudepth.base.console import log, shows_progress
 from hudepth.base.devices import build_trainer, check_shares, without_known_warnings
 from hudepth.base.errors import ConfigError
+from hudepth.base.files import output_folder
 from hudepth.base.instantiate import import_trusted
-from hudepth.base.options import Range, output_folder
+from hudepth.base.options import Range
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
 from hudepth.evaluation.lineage import note_scored

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from omegaconf import DictConfig
 from torch import nn
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import write_json
+from hudepth.base.files import output_folder, write_json
 from hudepth.base.machine import usable_cores
-from hudepth.base.options import Choice, Range, Size, output_folder, parse, plain
+from hudepth.base.options import Choice, Range, Size, parse
 from hudepth.export.bundle import halve, write_bundle, zip_folder
 from hudepth.export.card import model_card
 from hudepth.export.comparison_images import ComparisonImages, find_images
@@ -100,16 +99,15 @@ class Work:
         }
 
 
-def export(cfg: DictConfig) -> None:
+def export(config: dict[str, Any]) -> None:
     """Export a checkpoint in the configured formats.
 
     Args:
-        cfg: the configuration; see :class:`ExportOptions`.
+        config: conf/export.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user; formats exported before the error are kept.
     """
-    config = plain(cfg)
     options = parse(ExportOptions, {**config, **config["paths"]})
     if "int8" in options.format:
         check_calibration(options.calibration)

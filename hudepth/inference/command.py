@@ -7,17 +7,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
-from omegaconf import DictConfig
 
 from hudepth.base.camera import CameraOption, Intrinsics
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError, DataError
-from hudepth.base.files import write_json
+from hudepth.base.files import output_folder, write_json
 from hudepth.base.machine import usable_cores
-from hudepth.base.options import Choice, Range, output_folder, parse, plain
+from hudepth.base.options import Choice, Range, parse
 from hudepth.inference.depth_files import FORMATS, Style, write_depth
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.inputs import Item, find_inputs
@@ -62,16 +61,15 @@ class Job:
     tally: Tally = field(default_factory=Tally)
 
 
-def predict(cfg: DictConfig) -> None:
+def predict(config: dict[str, Any]) -> None:
     """Predict all inputs, then report what failed.
 
     Args:
-        cfg: the configuration; see :class:`PredictOptions`.
+        config: conf/predict.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user; for unreadable inputs, once all others are done.
     """
-    config = plain(cfg)
     options = parse(PredictOptions, {**config, "runs": config["paths"]["runs"]})
     camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
     inputs = find_inputs(options.input, recursive=options.recursive)

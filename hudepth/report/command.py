@@ -5,19 +5,18 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.options import convert, parse, plain
+from hudepth.base.options import convert, parse
 
 
-def report(cfg: Any) -> None:
+def report(config: dict[str, Any]) -> None:
     """Run the verb ``compare``, ``table``, ``sweep`` or ``figures``.
 
     Args:
-        cfg: conf/report.yaml with the command-line overrides.
+        config: conf/report.yaml with command-line overrides.
 
     Raises:
         HudepthError: with one line for the user.
     """
-    config = plain(cfg)
     verb = convert("verb", config["verb"], Literal["compare", "table", "sweep", "figures"])
     protocols = [name for name, protocol in (config["protocol"] or {}).items() if protocol]
     if verb in ("compare", "sweep"):

@@ -13,8 +13,8 @@ from rich import box
 
 from hudepth.base.console import log
 from hudepth.base.errors import DataError, HudepthError, did_you_mean
-from hudepth.base.files import write_json, write_text
-from hudepth.base.options import Range, output_folder
+from hudepth.base.files import output_folder, write_json, write_text
+from hudepth.base.options import Range
 from hudepth.base.tables import Cell, Table, stdout
 from hudepth.metrics.bootstrap import LEVEL, REPEATS, SEED, Difference, describe, paired_differences
 from hudepth.metrics.catalogue import metric_info

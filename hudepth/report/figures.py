@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError, HudepthError
-from hudepth.base.options import Range, output_folder
+from hudepth.base.files import output_folder
+from hudepth.base.options import Range
 from hudepth.evaluation.pictures import evenly_spaced, run_panels
 from hudepth.report.curves import draw_curves
 from hudepth.runs.history import read_history

@@ -10,8 +10,7 @@ from typing import Any
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import write_text
-from hudepth.base.options import output_folder
+from hudepth.base.files import output_folder, write_text
 from hudepth.base.tables import Table, stdout
 from hudepth.metrics.bootstrap import intervals
 from hudepth.metrics.catalogue import metric_info, metric_names

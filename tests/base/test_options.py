@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.options import Choice, Range, Size, check, convert, output_folder, parse
+from hudepth.base.files import output_folder
+from hudepth.base.options import Choice, Range, Size, check, convert, parse
 
 
 @dataclass(frozen=True)

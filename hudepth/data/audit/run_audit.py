@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 
 from hudepth.base.console import log
 from hudepth.base.errors import DataError
-from hudepth.base.files import write_json
-from hudepth.base.options import output_folder, parse
+from hudepth.base.files import output_folder, write_json
+from hudepth.base.options import parse
 from hudepth.data.audit.audit_tables import print_audit
 from hudepth.data.audit.duplicates import NEAR_BITS, find_duplicates
 from hudepth.data.audit.findings import Finding, judge_depth, judge_split

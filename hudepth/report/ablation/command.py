@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from hudepth.base.console import log, track
 from hudepth.base.errors import HudepthError
-from hudepth.base.files import write_json, write_text
-from hudepth.base.options import Range, output_folder
+from hudepth.base.files import output_folder, write_json, write_text
+from hudepth.base.options import Range
 from hudepth.metrics.bootstrap import REPEATS, SEED
 from hudepth.report.ablation.document import document, table_csv
 from hudepth.report.ablation.page import page
