@@ -7,6 +7,9 @@ from typing import NamedTuple, NotRequired, TypedDict
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from torch import Tensor
 
+DepthMap = Float[Tensor, "b 1 h w"]
+Mask = Bool[Tensor, "b 1 h w"]
+
 
 class RawBatch(TypedDict):
     """What the loader reads from the depth store, before it is moved to a device."""

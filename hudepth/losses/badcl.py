@@ -15,12 +15,13 @@ from functools import partial
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hudepth.base.masked import masked_mean, masked_sum
 from hudepth.base.normalise import denormalise_image
 from hudepth.base.options import Choice, Range, convert
+from hudepth.base.types import DepthMap, Mask
 from hudepth.losses.base import Loss, check_weights, difference
 
 CHOICES = {
@@ -48,7 +49,7 @@ def forward_difference(x: Float[Tensor, "b c h w"], *, dim: int) -> Float[Tensor
     return torch.diff(x, dim=dim, append=x.narrow(dim, -1, 1))
 
 
-def luma(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+def luma(image: Float[Tensor, "b 3 h w"]) -> DepthMap:
     """BT.601 luma of an RGB image, in the image's units."""
     red, green, blue = image.unbind(dim=1)
     return (BT601_LUMA[0] * red + BT601_LUMA[1] * green + BT601_LUMA[2] * blue).unsqueeze(1)
@@ -56,7 +57,7 @@ def luma(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
 
 def boundary_weight(
     image_dx: Float[Tensor, "b c h w"], image_dy: Float[Tensor, "b c h w"], *, sign: str = "plus"
-) -> Float[Tensor, "b 1 h w"]:
+) -> DepthMap:
     """B = exp(+-|grad I|), the gradient's magnitude averaged over channels (equation 2).
 
     Args:
@@ -72,18 +73,13 @@ def boundary_weight(
     return torch.exp(magnitude if sign == "plus" else -magnitude)
 
 
-def boundary_loss(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    weight: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-) -> Float[Tensor, ""]:
+def boundary_loss(pred: DepthMap, target: DepthMap, weight: DepthMap, valid: Mask) -> Float[Tensor, ""]:
     """Mean over valid pixels of the absolute error times its :func:`boundary_weight` (equation 1)."""
     return masked_mean(weight * difference(pred, target, valid).abs(), valid)
 
 
 def smoothness_loss(
-    pred: Float[Tensor, "b 1 h w"], image_dx: Float[Tensor, "b c h w"], image_dy: Float[Tensor, "b c h w"]
+    pred: DepthMap, image_dx: Float[Tensor, "b c h w"], image_dy: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of neighbouring predictions, damped where the image has edges (equation 3).
 
@@ -98,12 +94,7 @@ def smoothness_loss(
 
 
 def scaling_factor(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    *,
-    per: str = "image",
-    eps: float = 1e-8,
+    pred: DepthMap, target: DepthMap, valid: Mask, *, per: str = "image", eps: float = 1e-8
 ) -> Float[Tensor, "n 1 1 1"]:
     """The factor s = sum D / (sum D^ + eps) of equation 5, over valid pixels.
 
@@ -125,9 +116,9 @@ def scaling_factor(
 
 
 def scaling_loss(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
+    pred: DepthMap,
+    target: DepthMap,
+    valid: Mask,
     *,
     per: str = "image",
     mode: str = "weight",

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.masked import full_precision
 from hudepth.base.options import Range, convert
-from hudepth.base.types import LossTerms
+from hudepth.base.types import DepthMap, LossTerms, Mask
 
 Positive = Annotated[float, Range(0, above=True)]
 
@@ -27,13 +27,7 @@ class Loss(nn.Module, ABC):
     weights: Mapping[str, float] = {}
     """Of each term; 1 if not listed."""
 
-    def forward(
-        self,
-        pred: Float[Tensor, "b 1 h w"],
-        target: Float[Tensor, "b 1 h w"],
-        image: Float[Tensor, "b 3 h w"],
-        valid: Bool[Tensor, "b 1 h w"],
-    ) -> LossTerms:
+    def forward(self, pred: DepthMap, target: DepthMap, image: Float[Tensor, "b 3 h w"], valid: Mask) -> LossTerms:
         """Return the weighted sum and each raw term, in float32 (float64 for float64) even under autocast.
 
         Args:
@@ -80,8 +74,6 @@ def check_weights(key: str, weights: Mapping[str, float]) -> None:
         raise ConfigError(f"{key}: {', '.join(weights)} all have weight 0. Give at least one a positive weight.")
 
 
-def difference(
-    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> Float[Tensor, "b 1 h w"]:
+def difference(pred: DepthMap, target: DepthMap, valid: Mask) -> DepthMap:
     """Return pred - target, 0 where not valid; masked first, so that no invalid NaN enters further arithmetic."""
     return torch.where(valid, pred - target, 0.0)

@@ -8,38 +8,29 @@ from __future__ import annotations
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hudepth.base.masked import masked_mean
 from hudepth.base.options import Range, convert
+from hudepth.base.types import DepthMap, Mask
 from hudepth.losses.base import Positive, SingleTermLoss, difference
 
 MIN_UNIT_DEPTH = 1e-3
 """Depths below this count as this under a logarithm: 1 cm at a maximum depth of 10 m."""
 
 
-def l1_loss(
-    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> Float[Tensor, ""]:
+def l1_loss(pred: DepthMap, target: DepthMap, valid: Mask) -> Float[Tensor, ""]:
     """Mean absolute error."""
     return masked_mean(difference(pred, target, valid).abs(), valid)
 
 
-def l2_loss(
-    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> Float[Tensor, ""]:
+def l2_loss(pred: DepthMap, target: DepthMap, valid: Mask) -> Float[Tensor, ""]:
     """Mean squared error."""
     return masked_mean(difference(pred, target, valid).square(), valid)
 
 
-def berhu_loss(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    *,
-    threshold: float = 0.2,
-) -> Float[Tensor, ""]:
+def berhu_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, threshold: float = 0.2) -> Float[Tensor, ""]:
     """Reverse Huber: |e| up to c, (e^2 + c^2) / (2 c) above (Laina et al. 2016).
 
     c = ``threshold`` * the largest |e| among the valid pixels of the batch; no gradient flows through it.
@@ -50,9 +41,7 @@ def berhu_loss(
     return masked_mean(torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)), valid)
 
 
-def log_difference(
-    pred: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> Float[Tensor, "b 1 h w"]:
+def log_difference(pred: DepthMap, target: DepthMap, valid: Mask) -> DepthMap:
     """Return ln pred - ln target, 0 where not valid. Depths below :data:`MIN_UNIT_DEPTH` count as that."""
     pred = torch.where(valid, pred, 1.0).clamp_min(MIN_UNIT_DEPTH)
     target = torch.where(valid, target, 1.0).clamp_min(MIN_UNIT_DEPTH)
@@ -60,12 +49,7 @@ def log_difference(
 
 
 def silog_loss(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    *,
-    variance_focus: float = 0.85,
-    factor: float = 10.0,
+    pred: DepthMap, target: DepthMap, valid: Mask, *, variance_focus: float = 0.85, factor: float = 10.0
 ) -> Float[Tensor, ""]:
     """Scale-invariant error: factor * sqrt(mean(g^2) - variance_focus * mean(g)^2), g = ln pred - ln target.
 

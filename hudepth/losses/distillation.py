@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.masked import full_precision, masked_mean, masked_sum
 from hudepth.base.options import Choice, convert
+from hudepth.base.types import DepthMap, Mask
 from hudepth.losses.base import Positive
 from hudepth.losses.baselines import MIN_UNIT_DEPTH, log_difference
 
@@ -17,9 +18,7 @@ KINDS = ("metric", "affine_depth", "affine_inverse")
 """Values a teacher may have: metres; depth, or inverse depth (disparity), up to scale and shift."""
 
 
-def normalised_by_mean(
-    x: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"], *, eps: float = 1e-6
-) -> Float[Tensor, "b 1 h w"]:
+def normalised_by_mean(x: DepthMap, valid: Mask, *, eps: float = 1e-6) -> DepthMap:
     """Return (x - mean) / mean absolute deviation over the valid pixels of each image; 0 where not valid.
 
     (Equation 5 of Ranftl et al. 2022, with the mean in the median's place, which is as blind to scale and shift.)
@@ -29,9 +28,7 @@ def normalised_by_mean(
     return centred / (centred.abs().sum(dim=(1, 2, 3), keepdim=True) / count + eps)
 
 
-def affine_invariant_loss(
-    pred: Float[Tensor, "b 1 h w"], teacher: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> Float[Tensor, ""]:
+def affine_invariant_loss(pred: DepthMap, teacher: DepthMap, valid: Mask) -> Float[Tensor, ""]:
     """Mean absolute difference after each image of both was brought to mean 0 and mean absolute deviation 1."""
     return masked_mean((normalised_by_mean(pred, valid) - normalised_by_mean(teacher, valid)).abs(), valid)
 
@@ -52,7 +49,7 @@ class Distillation(nn.Module):
         self.kind = convert("distill.kind", kind, Annotated[str, Choice(KINDS)])
         self.weight = convert("distill.weight", weight, Positive, default=1.0)
 
-    def forward(self, pred: Float[Tensor, "b 1 h w"], teacher: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    def forward(self, pred: DepthMap, teacher: DepthMap) -> Float[Tensor, ""]:
         """Return the distance, before its weight.
 
         Args:

@@ -8,22 +8,17 @@ from __future__ import annotations
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hudepth.base.masked import masked_mean
 from hudepth.base.options import Range, convert
+from hudepth.base.types import DepthMap, Mask
 from hudepth.losses.base import SingleTermLoss
 from hudepth.losses.baselines import log_difference
 
 
-def gradient_matching_loss(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    *,
-    scales: int = 4,
-) -> Float[Tensor, ""]:
+def gradient_matching_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, scales: int = 4) -> Float[Tensor, ""]:
     """Mean over valid neighbours of how much the log ratio of prediction and ground truth changes, summed over scales.
 
     It ignores a scale factor per image, and penalises edges that are missing, blurred or spurious.

@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.types import LossTerms
+from hudepth.base.types import DepthMap, LossTerms, Mask
 from hudepth.losses.base import check_weights
 
 
@@ -37,13 +37,7 @@ class Mixture(nn.Module):
         self.weights = {name: float(weight) for name, weight in weights.items() if weight}
         self.losses = nn.ModuleDict({name: losses[name] for name in self.weights})
 
-    def forward(
-        self,
-        pred: Float[Tensor, "b 1 h w"],
-        target: Float[Tensor, "b 1 h w"],
-        image: Float[Tensor, "b 3 h w"],
-        valid: Bool[Tensor, "b 1 h w"],
-    ) -> LossTerms:
+    def forward(self, pred: DepthMap, target: DepthMap, image: Float[Tensor, "b 3 h w"], valid: Mask) -> LossTerms:
         """Return the weighted sum of the losses' totals, and all their terms; arguments as in :class:`Loss`."""
         parts = {name: loss(pred, target, image, valid) for name, loss in self.losses.items()}
         total = torch.stack([self.weights[name] * part.total for name, part in parts.items()]).sum()

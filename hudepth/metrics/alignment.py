@@ -12,10 +12,10 @@ An aligned score rates the predicted shape, not its scale in metres: never compa
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.types import DepthMap, Mask
 
 ALIGNMENTS = ("none", "median", "least_squares", "affine_inverse")
 
@@ -24,9 +24,7 @@ MAX_DEPTH_M = 1e3
 _MIN_DEPTH_M = 1e-3
 
 
-def align(
-    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"], *, kind: str
-) -> Float[Tensor, "b 1 h w"]:
+def align(pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, kind: str) -> DepthMap:
     """Return the predictions, each aligned with its ground truth over its valid pixels.
 
     An image without a valid pixel is returned unchanged, as is one with a median of 0 or less. A prediction that is

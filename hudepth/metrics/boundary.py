@@ -14,10 +14,11 @@ itself: coarsely quantised ground truth has steps where the scene has none.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from hudepth.base.masked import full_precision
+from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.canny import canny_edges, chamfer_px
 from hudepth.metrics.depth import MIN_DEPTH_M
 
@@ -31,9 +32,7 @@ BOUNDARY_NAMES = (
 """Keys of :func:`boundary_metrics`."""
 
 
-def boundary_metrics(
-    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> dict[str, Float64[Tensor, " b"]]:
+def boundary_metrics(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float64[Tensor, " b"]]:
     """All measures of this file with their published settings.
 
     Args:
@@ -55,11 +54,7 @@ def boundary_metrics(
 
 
 def edge_scores(
-    pred_m: Float[Tensor, "b 1 h w"],
-    target_m: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    *,
-    threshold: float,
+    pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, threshold: float
 ) -> dict[str, Float64[Tensor, " b"]]:
     """Precision, recall and F1 of predicted edge pixels (Hu et al. 2019).
 
@@ -81,9 +76,9 @@ def edge_scores(
 
 
 def si_boundary_f1(
-    pred_m: Float[Tensor, "b 1 h w"],
-    target_m: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
+    pred_m: DepthMap,
+    target_m: DepthMap,
+    valid: Mask,
     *,
     min_ratio: float = 1.05,
     max_ratio: float = 1.25,
@@ -124,9 +119,9 @@ def si_boundary_f1(
 
 
 def depth_boundary_errors(
-    pred_m: Float[Tensor, "b 1 h w"],
-    target_m: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
+    pred_m: DepthMap,
+    target_m: DepthMap,
+    valid: Mask,
     *,
     sigma_px: float = 2**0.5,
     low: float = 0.15,
@@ -177,7 +172,7 @@ def _squared_slopes(pred_m: Tensor, target_m: Tensor, valid: Tensor) -> tuple[Te
     return pred, target
 
 
-def _squared_sobel(x: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 rows columns"]:
+def _squared_sobel(x: DepthMap) -> Float[Tensor, "b 1 rows columns"]:
     smooth = x[..., :-2, :] + 2 * x[..., 1:-1, :] + x[..., 2:, :]
     across = smooth[..., 2:] - smooth[..., :-2]
     smooth = x[..., :-2] + 2 * x[..., 1:-1] + x[..., 2:]
@@ -194,12 +189,7 @@ def _edge_scores(pred: Tensor, target: Tensor, threshold: float) -> dict[str, Te
 
 
 def _occlusions(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    ratios: Float64[Tensor, " steps"],
-    *,
-    dim: int,
+    pred: DepthMap, target: DepthMap, valid: Mask, ratios: Float64[Tensor, " steps"], *, dim: int
 ) -> Int64[Tensor, "3 b 2 steps"]:
     """Count hits, predicted and true occlusions between neighbours along ``dim``, both ways, at each ratio."""
     size = valid.shape[dim] - 1

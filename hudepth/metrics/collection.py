@@ -17,6 +17,7 @@ from torchmetrics import Metric, MetricCollection
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.options import Range, convert
+from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.catalogue import Function, metric_info, registered_functions
 from hudepth.metrics.depth import METRIC_NAMES, SUM_NAMES, depth_metrics_from_sums, depth_sums
 from hudepth.metrics.ssim import ssim_sums
@@ -53,9 +54,7 @@ class DepthMetrics(Metric):
         self.add_state("totals", torch.zeros(size, dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("images", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
-    def update(
-        self, pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-    ) -> None:
+    def update(self, pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> None:
         """Add a batch. Images without a valid pixel are skipped.
 
         Args:
@@ -179,9 +178,7 @@ class ImageMetric(Metric, ABC):
     ) -> tuple[Float[Tensor, " b"], Bool[Tensor, " b"]]:
         """Return the metric of each image, and which of them count."""
 
-    def update(
-        self, pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-    ) -> None:
+    def update(self, pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> None:
         """Add a batch; arguments as in :meth:`DepthMetrics.update`."""
         values, counts = self.measure(pred_m, target_m, valid)
         self.total = self.total + torch.where(counts, values, 0.0).sum()

@@ -24,10 +24,11 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from hudepth.base.masked import full_precision
+from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.catalogue import depth_names
 
 MIN_DEPTH_M = 1e-3
@@ -55,7 +56,7 @@ class DepthMaps(NamedTuple):
     """Mean log ratio of each image, taken out of ``log`` and ``log_squared``: silog subtracts nearly equal sums."""
 
     def sums(
-        self, valid: Bool[Tensor, "b 1 h w"], *, masked: bool, rows: slice = slice(None), columns: slice = slice(None)
+        self, valid: Mask, *, masked: bool, rows: slice = slice(None), columns: slice = slice(None)
     ) -> dict[str, Float64[Tensor, " b"]]:
         """Sum over the valid pixels of some rows and columns.
 
@@ -82,9 +83,7 @@ class DepthMaps(NamedTuple):
 
 
 @torch.no_grad()
-def depth_maps(
-    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> DepthMaps:
+def depth_maps(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> DepthMaps:
     """Compute the terms of the metrics at each pixel.
 
     Args:
@@ -119,9 +118,7 @@ def depth_maps(
     return DepthMaps(maps, shift.double())
 
 
-def depth_sums(
-    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> dict[str, Float64[Tensor, " b"]]:
+def depth_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float64[Tensor, " b"]]:
     """Sum the terms of the metrics over each image's valid pixels.
 
     Args:
@@ -166,12 +163,7 @@ def depth_metrics_from_sums(
 
 
 def depth_metrics(
-    pred_m: Float[Tensor, "b 1 h w"],
-    target_m: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
-    *,
-    silog_lambda: float = 1.0,
-    silog_factor: float = 100.0,
+    pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, silog_lambda: float = 1.0, silog_factor: float = 100.0
 ) -> dict[str, Float64[Tensor, " b"]]:
     """Metrics of each image: :func:`depth_metrics_from_sums` of :func:`depth_sums`."""
     sums = depth_sums(pred_m, target_m, valid)

@@ -21,11 +21,12 @@ from torch import Tensor
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.masked import full_precision, masked_sum
+from hudepth.base.types import DepthMap, Mask
 
 
 def ssim_map(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
+    pred: DepthMap,
+    target: DepthMap,
     *,
     data_range: float,
     window: int = 11,
@@ -65,9 +66,9 @@ def ssim_map(
 
 
 def ssim(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"] | None = None,
+    pred: DepthMap,
+    target: DepthMap,
+    valid: Mask | None = None,
     *,
     data_range: float,
     window: int = 11,
@@ -86,9 +87,9 @@ def ssim(
 
 
 def ssim_sums(
-    pred: Float[Tensor, "b 1 h w"],
-    target: Float[Tensor, "b 1 h w"],
-    valid: Bool[Tensor, "b 1 h w"],
+    pred: DepthMap,
+    target: DepthMap,
+    valid: Mask,
     *,
     data_range: float,
     window: int = 11,
@@ -106,7 +107,7 @@ def ssim_sums(
     return masked_sum(values, whole, dim=(1, 2, 3)).flatten().double(), whole.sum(dim=(1, 2, 3))
 
 
-def whole_windows(valid: Bool[Tensor, "b 1 h w"], window: int) -> Bool[Tensor, "b 1 rows columns"]:
+def whole_windows(valid: Mask, window: int) -> Bool[Tensor, "b 1 rows columns"]:
     """Tell of each window, in the order of :func:`ssim_map`, whether all its pixels are valid."""
     return window_sum(valid.float(), [1.0] * window) == window**2
 

@@ -15,11 +15,12 @@ from dataclasses import astuple, dataclass, fields
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int, Shaped
+from jaxtyping import Float64, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hudepth.base.masked import full_precision
+from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.depth import DELTAS, MIN_DEPTH_M
 
 DEPTH_EDGES_M = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
@@ -69,9 +70,7 @@ class Stratum:
     delta1: float
 
 
-def strata_sums(
-    pred_m: Float[Tensor, "b 1 h w"], target_m: Float[Tensor, "b 1 h w"], valid: Bool[Tensor, "b 1 h w"]
-) -> Float64[Tensor, "b bins 5"]:
+def strata_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float64[Tensor, "b bins 5"]:
     """Sum errors over each bin of :data:`STRATA`, image by image.
 
     Args:
