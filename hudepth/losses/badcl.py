@@ -60,13 +60,8 @@ def boundary_weight(
 ) -> DepthMap:
     """B = exp(+-|grad I|), the gradient's magnitude averaged over channels (equation 2).
 
-    Args:
-        image_dx: horizontal differences of the image. Expected without gradient: the root has none at 0.
-        image_dy: vertical differences.
-        sign: "plus" stresses edges, as the paper says of B; "minus" spares them.
-
-    Raises:
-        ConfigError: if ``sign`` is unknown.
+    The differences of the image are expected without gradient: the root has none at 0. ``sign``: "plus" stresses edges,
+    as the paper says of B; "minus" spares them. Raises ConfigError if it is neither.
     """
     check_choices(boundary_sign=sign)
     magnitude = torch.hypot(image_dx, image_dy).mean(dim=1, keepdim=True)
@@ -83,11 +78,10 @@ def smoothness_loss(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of neighbouring predictions, damped where the image has edges (equation 3).
 
-    It concerns the prediction only and is averaged over all pixels, so it also acts where the ground truth is
-    unmeasured. Over several channels the magnitudes of the image's differences are averaged.
+    It is averaged over all pixels, so it also acts where the ground truth is unmeasured. Over several channels the
+    magnitudes of the image's differences are averaged.
     """
-    weight_x = torch.exp(-image_dx.abs().mean(dim=1, keepdim=True))
-    weight_y = torch.exp(-image_dy.abs().mean(dim=1, keepdim=True))
+    weight_x, weight_y = (torch.exp(-x.abs().mean(dim=1, keepdim=True)) for x in (image_dx, image_dy))
     horizontal = forward_difference(pred, dim=-1).abs() * weight_x
     vertical = forward_difference(pred, dim=-2).abs() * weight_y
     return (horizontal + vertical).mean()
@@ -96,19 +90,11 @@ def smoothness_loss(
 def scaling_factor(
     pred: DepthMap, target: DepthMap, valid: Mask, *, per: str = "image", eps: float = 1e-8
 ) -> Float[Tensor, "n 1 1 1"]:
-    """The factor s = sum D / (sum D^ + eps) of equation 5, over valid pixels.
+    """The factor s = sum D / (sum D^ + eps) of equation 5, over valid pixels, for each "image" (n = b) or the "batch"
+    (n = 1).
 
-    A negative sum of predictions, which unit depth cannot have, counts as 0: s stays finite and not negative.
-
-    Args:
-        pred: unit depth.
-        target: unit depth; ignored where not valid.
-        valid: True where the ground truth is measured.
-        per: s for each "image" (n = b), or one for the "batch" (n = 1).
-        eps: added to the sum of predictions.
-
-    Raises:
-        ConfigError: if ``per`` is neither "image" nor "batch".
+    A negative sum of predictions, which unit depth cannot have, counts as 0: s stays finite and not negative. Raises
+    ConfigError if ``per`` is neither "image" nor "batch".
     """
     check_choices(scale_per=per)
     dim = (1, 2, 3) if per == "image" else (0, 1, 2, 3)
@@ -125,16 +111,11 @@ def scaling_loss(
     gradient: str = "flow",
     eps: float = 1e-8,
 ) -> Float[Tensor, ""]:
-    """Mean over valid pixels of an error that is scaled by s (equation 4; see :func:`scaling_factor`).
+    """Mean over valid pixels of an error that is scaled by s (equation 4; see :func:`scaling_factor`), on unit depth.
 
     Args:
-        pred: unit depth.
-        target: unit depth; ignored where not valid.
-        valid: True where the ground truth is measured.
-        per: s for each "image", or one for the "batch".
         mode: "weight": s |D^ - D|, as printed; "align": |s D^ - D|, the usual alignment of scale.
         gradient: "flow" through s, or "stop" there.
-        eps: added to the sum of predictions.
 
     Raises:
         ConfigError: if an option is unknown.
@@ -152,16 +133,13 @@ class BADCL(Loss):
     """The paper's loss: boundary, smoothness and scaling terms, weighted and summed (section 3.3).
 
     Args:
-        boundary: weight of the boundary term, at least 0. A term of weight 0 is not computed.
-        smoothness: weight of the smoothness term.
-        scaling: weight of the scaling term.
+        boundary, smoothness, scaling: weights of the terms, at least 0. A term of weight 0 is not computed.
         eps: added to the sum of predictions in the scaling factor, at least 1e-12.
         boundary_sign: "plus" or "minus" in the exponent of the boundary weight.
         image_space: "unit": the image in [0, 1] guides both weights; "normalised": as the network sees it.
         image_channels: "grey": gradients of the luma; "colour": their magnitudes averaged over channels.
         scale_per: one scaling factor per "image" or per "batch".
-        scale_mode: "weight": s |D^ - D|, as printed; "align": |s D^ - D|.
-        scale_gradient: "flow" or "stop": whether gradients pass through s.
+        scale_mode, scale_gradient: as in :func:`scaling_loss`.
 
     Raises:
         ConfigError: if an option is unknown, a weight negative or not finite, all are 0, or eps is too small.
@@ -187,9 +165,7 @@ class BADCL(Loss):
         convert("loss.eps", eps, Annotated[float, Range(1e-12)], default=1e-8)  # smaller ones vanish in float32
         check_choices(boundary_sign=boundary_sign, image_space=image_space, image_channels=image_channels)
         check_choices(scale_per=scale_per, scale_mode=scale_mode, scale_gradient=scale_gradient)
-        self.boundary_sign = boundary_sign
-        self.image_space = image_space
-        self.image_channels = image_channels
+        self.boundary_sign, self.image_space, self.image_channels = boundary_sign, image_space, image_channels
         self.scaling_loss = partial(scaling_loss, per=scale_per, mode=scale_mode, gradient=scale_gradient, eps=eps)
 
     def terms(self, pred: Tensor, target: Tensor, image: Tensor, valid: Tensor) -> dict[str, Tensor]:

@@ -30,11 +30,8 @@ class Loss(nn.Module, ABC):
     def forward(self, pred: DepthMap, target: DepthMap, image: Float[Tensor, "b 3 h w"], valid: Mask) -> LossTerms:
         """Return the weighted sum and each raw term, in float32 (float64 for float64) even under autocast.
 
-        Args:
-            pred: unit depth in [0, 1].
-            target: unit depth in [0, 1]; ignored where not valid.
-            image: RGB, ImageNet-normalised. No gradient reaches it.
-            valid: True where the ground truth is measured.
+        ``pred`` and ``target`` are unit depth in [0, 1]; ``target`` is ignored where not ``valid``, that is not
+        measured. ``image`` is RGB, ImageNet-normalised; no gradient reaches it.
         """
         with torch.autocast(pred.device.type, enabled=False):
             terms = self.terms(full_precision(pred), full_precision(target), full_precision(image.detach()), valid)
@@ -51,7 +48,6 @@ class SingleTermLoss(Loss):
     """A loss of one term that does not look at the image."""
 
     name: ClassVar[str]
-    """What its term is called."""
 
     def terms(self, pred: Tensor, target: Tensor, image: Tensor, valid: Tensor) -> dict[str, Tensor]:
         """Return the term by name."""
@@ -63,11 +59,7 @@ class SingleTermLoss(Loss):
 
 
 def check_weights(key: str, weights: Mapping[str, float]) -> None:
-    """Check the weights of a sum.
-
-    Raises:
-        ConfigError: if a weight is negative or not finite, or all are 0.
-    """
+    """Raise :class:`ConfigError` if a weight of a sum is negative or not finite, or all are 0."""
     for name, weight in weights.items():
         convert(f"{key}.{name}", weight, Annotated[float, Range(0)])
     if not any(weights.values()):

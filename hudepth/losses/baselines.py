@@ -43,8 +43,7 @@ def berhu_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, threshold: floa
 
 def log_difference(pred: DepthMap, target: DepthMap, valid: Mask) -> DepthMap:
     """Return ln pred - ln target, 0 where not valid. Depths below :data:`MIN_UNIT_DEPTH` count as that."""
-    pred = torch.where(valid, pred, 1.0).clamp_min(MIN_UNIT_DEPTH)
-    target = torch.where(valid, target, 1.0).clamp_min(MIN_UNIT_DEPTH)
+    pred, target = (torch.where(valid, x, 1.0).clamp_min(MIN_UNIT_DEPTH) for x in (pred, target))
     return pred.log() - target.log()
 
 
@@ -53,9 +52,8 @@ def silog_loss(
 ) -> Float[Tensor, ""]:
     """Scale-invariant error: factor * sqrt(mean(g^2) - variance_focus * mean(g)^2), g = ln pred - ln target.
 
-    The loss of Eigen et al. 2014 under a root and with the constants of BTS and AdaBins. Depths below
-    :data:`MIN_UNIT_DEPTH` count as that. ``variance_focus`` is in [0, 1]: 0 leaves the RMSE of logs, 1
-    forgives any common scale.
+    Eigen et al. 2014, under a root and with the constants of BTS and AdaBins. Depths below :data:`MIN_UNIT_DEPTH` count
+    as that. ``variance_focus`` is in [0, 1]: 0 leaves the RMSE of logs, 1 forgives any common scale.
     """
     g = log_difference(pred, target, valid)
     mean = masked_mean(g, valid)
@@ -87,14 +85,7 @@ class L2(SingleTermLoss):
 
 
 class BerHu(SingleTermLoss):
-    """:func:`berhu_loss` as a module.
-
-    Args:
-        threshold: c as a fraction of the largest error, in (0, 1].
-
-    Raises:
-        ConfigError: if ``threshold`` is out of range.
-    """
+    """:func:`berhu_loss` as a module; ``threshold``: c as a fraction of the largest error, in (0, 1]."""
 
     name = "berhu"
 
@@ -108,23 +99,14 @@ class BerHu(SingleTermLoss):
 
 
 class SILog(SingleTermLoss):
-    """:func:`silog_loss` as a module.
-
-    Args:
-        variance_focus: share of the squared mean that is forgiven, in [0, 1].
-        factor: scale of the loss, positive.
-
-    Raises:
-        ConfigError: if an option is out of range.
-    """
+    """:func:`silog_loss` as a module; ``variance_focus`` is in [0, 1], ``factor`` positive."""
 
     name = "silog"
 
     def __init__(self, *, variance_focus: float = 0.85, factor: float = 10.0) -> None:
         super().__init__()
-        self.variance_focus = convert(
-            "loss.variance_focus", variance_focus, Annotated[float, Range(0, 1)], default=0.85
-        )
+        share = Annotated[float, Range(0, 1)]
+        self.variance_focus = convert("loss.variance_focus", variance_focus, share, default=0.85)
         self.factor = convert("loss.factor", factor, Positive, default=10.0)
 
     def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:

@@ -36,12 +36,8 @@ def affine_invariant_loss(pred: DepthMap, teacher: DepthMap, valid: Mask) -> Flo
 class Distillation(nn.Module):
     """The distance from a teacher's depths, times a weight; added to the loss of the ground truth.
 
-    Args:
-        kind: one of :data:`KINDS`. ``metric`` compares logarithms of depth.
-        weight: positive.
-
-    Raises:
-        ConfigError: for an unknown kind or another weight.
+    ``kind`` is one of :data:`KINDS`, of which ``metric`` compares logarithms of depth; ``weight`` is positive. Raises
+    ConfigError for others.
     """
 
     def __init__(self, *, kind: str = "metric", weight: float = 1.0) -> None:
@@ -52,9 +48,8 @@ class Distillation(nn.Module):
     def forward(self, pred: DepthMap, teacher: DepthMap) -> Float[Tensor, ""]:
         """Return the distance, before its weight.
 
-        Args:
-            pred: unit depth.
-            teacher: unit depth if the kind is ``metric``, else the teacher's values; 0 where it has none.
+        ``pred`` is unit depth; ``teacher`` is unit depth if the kind is ``metric``, else the teacher's values; 0 where
+        it has none.
         """
         valid = teacher > 0
         with torch.autocast(pred.device.type, enabled=False):

@@ -21,13 +21,9 @@ from hudepth.losses.baselines import log_difference
 def gradient_matching_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, scales: int = 4) -> Float[Tensor, ""]:
     """Mean over valid neighbours of how much the log ratio of prediction and ground truth changes, summed over scales.
 
-    It ignores a scale factor per image, and penalises edges that are missing, blurred or spurious.
-
-    Args:
-        pred: unit depth.
-        target: unit depth; ignored where not valid.
-        valid: True where the ground truth is measured; a difference counts where both its pixels are.
-        scales: 1 compares neighbours, 2 also every second pixel with the next second pixel, and so on.
+    It ignores a scale factor per image, and penalises edges that are missing, blurred or spurious. Both maps are unit
+    depth; a difference counts where both its pixels are valid. ``scales``: 1 compares neighbours, 2 also every second
+    pixel with the next second pixel, and so on.
     """
     ratio = log_difference(pred, target, valid)
     total = 0 * ratio.sum()  # an image of one pixel has no neighbours, but a gradient
@@ -43,14 +39,7 @@ def gradient_matching_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, sca
 
 
 class GradientMatching(SingleTermLoss):
-    """:func:`gradient_matching_loss` as a module.
-
-    Args:
-        scales: at least 1.
-
-    Raises:
-        ConfigError: if ``scales`` is less.
-    """
+    """:func:`gradient_matching_loss` as a module, on at least one scale."""
 
     name = "gradient"
 

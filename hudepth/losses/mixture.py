@@ -15,14 +15,9 @@ from hudepth.losses.base import check_weights
 
 
 class Mixture(nn.Module):
-    """Several losses, each with a weight; the terms of all are logged.
+    """Several losses by name, each with a weight; the terms of all are logged, a loss of weight 0 is not computed.
 
-    Args:
-        losses: by name.
-        weights: of each; a loss of weight 0 is not computed.
-
-    Raises:
-        ConfigError: if the names differ, a weight is negative or not finite, or all are 0.
+    Raises ConfigError if the names differ, a weight is negative or not finite, or all are 0.
     """
 
     def __init__(self, *, losses: Mapping[str, nn.Module], weights: Mapping[str, float]) -> None:

@@ -31,14 +31,8 @@ def align(pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, kind: str) -> De
     constant where valid has no scale to fit: it is shifted. A NaN or infinite prediction at a valid pixel may spread
     over its image. ``least_squares`` may return 0 m and less.
 
-    Args:
-        pred_m: predicted depth [m].
-        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: which pixels the alignment may see.
-        kind: one of :data:`ALIGNMENTS`.
-
-    Raises:
-        ConfigError: if the kind is unknown.
+    Depths are in metres, ``target_m`` positive where valid and ignored elsewhere. Raises ConfigError if ``kind`` is not
+    one of :data:`ALIGNMENTS`.
     """
     if kind not in ALIGNMENTS:
         raise ConfigError(

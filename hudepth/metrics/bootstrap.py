@@ -53,21 +53,15 @@ class Difference:
 
 @dataclass(frozen=True)
 class Draws:
-    """Metrics of resampled sets."""
+    """Metrics of resampled sets, [repeats] by name, and how many scenes define each."""
 
     metrics: dict[str, Floats]
-    """[repeats] by name."""
     scenes: dict[str, int]
-    """How many scenes define each metric."""
 
 
 class Resampler:
-    """Draws of scenes, made once for all tables of the same images.
-
-    Args:
-        table: one of them; an image whose scene is empty counts as a scene of its own.
-        repeats: how many sets to draw.
-        seed: of the draws.
+    """Draws of scenes, made once for all tables of the same images; one whose scene is empty counts as a scene of its
+    own.
     """
 
     def __init__(self, table: ImageTable, *, repeats: int = REPEATS, seed: int | Sequence[int] = SEED) -> None:
@@ -85,12 +79,7 @@ class Resampler:
             yield generator.multinomial(self._count, share, size=len(part)).astype(np.float64)
 
     def draws(self, table: ImageTable, **options: Unpack[SummaryOptions]) -> Draws:
-        """Return the metrics of the drawn sets.
-
-        Args:
-            table: of the same images, scenes and pixels in the same order as the resampler's.
-            **options: as in :func:`hudepth.metrics.summary.summarise`.
-        """
+        """Return the metrics of the drawn sets, for a table of the same images, scenes and pixels in the same order."""
         columns = additive(table, averaging=options["averaging"])
         # [scenes, 2 metrics]: sums of each scene, so that a draw costs scenes and not images
         flat = [row[self._counted] for column in columns.values() for row in column]
@@ -111,16 +100,11 @@ class Resampler:
 def bootstrap(
     table: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, Floats]:
-    """Return the metrics of resampled sets.
+    """Return the metrics of resampled sets, [repeats] by name; tables of the same images get the same draws.
 
-    Args:
-        table: of the images; one whose scene is empty counts as a scene of its own.
-        repeats: how many sets to draw.
-        seed: of the draws. Tables of the same images get the same draws.
-        **options: as in :func:`hudepth.metrics.summary.summarise`.
-
-    Returns:
-        [repeats] by metric. NaN where a prediction was NaN, and in draws without an image that defines the metric.
+    An image whose scene is empty counts as a scene of its own. ``options`` are those of
+    :func:`~hudepth.metrics.summary.summarise`. NaN where a prediction was NaN, and in draws without an image that
+    defines the metric.
     """
     return Resampler(table, repeats=repeats, seed=seed).draws(table, **options).metrics
 
@@ -128,10 +112,9 @@ def bootstrap(
 def intervals(
     table: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, tuple[float, float]]:
-    """Return the interval of each metric, arguments as in :func:`bootstrap`.
+    """Return the interval (low, high) of each metric, arguments as in :func:`bootstrap`.
 
-    Returns:
-        (low, high) by metric; NaN where a prediction was NaN or fewer than :data:`MIN_SCENES` scenes define the metric.
+    NaN where a prediction was NaN or fewer than :data:`MIN_SCENES` scenes define the metric.
     """
     draws = Resampler(table, repeats=repeats, seed=seed).draws(table, **options)
     return {name: interval_of(values, draws.scenes[name]) for name, values in draws.metrics.items()}
@@ -140,15 +123,10 @@ def intervals(
 def paired_differences(
     a: ImageTable, b: ImageTable, *, repeats: int = REPEATS, seed: int = SEED, **options: Unpack[SummaryOptions]
 ) -> dict[str, Difference]:
-    """Return b - a of two results on the same images, both resampled with the same draws.
+    """Return b - a of two results on the same images, for each metric of both, resampled with the same draws.
 
-    What makes an image hard then affects both sides and cancels. Arguments as in :func:`bootstrap`.
-
-    Returns:
-        For each metric of both; its interval is NaN as in :func:`intervals`.
-
-    Raises:
-        DataError: if the rows are not of the same images, scenes and pixels in the same order.
+    What makes an image hard then affects both sides and cancels. Arguments as in :func:`bootstrap`, NaN as in
+    :func:`intervals`. Raises DataError if the rows are not of the same images, scenes and pixels in the same order.
     """
     if a.ids != b.ids or a.scenes != b.scenes or not np.array_equal(a.pixels, b.pixels):
         raise DataError(
@@ -164,15 +142,10 @@ def unpaired_differences(
 ) -> dict[str, Difference]:
     """Return b - a of two results on different images, as of two splits, each resampled on its own.
 
-    Wider than :func:`paired_differences`, and too narrow for sets that share scenes. Arguments as in :func:`bootstrap`.
-
-    Returns:
-        For each metric of both; its interval is NaN as in :func:`intervals`.
+    Wider than :func:`paired_differences`, and too narrow for sets that share scenes. Arguments and NaN are the same.
     """
-    draws = [
-        Resampler(table, repeats=repeats, seed=[seed, i]).draws(table, **options) for i, table in enumerate((a, b))
-    ]
-    return _differences(a, b, draws[0], draws[1], **options)
+    draws = (Resampler(x, repeats=repeats, seed=[seed, i]).draws(x, **options) for i, x in enumerate((a, b)))
+    return _differences(a, b, *draws, **options)
 
 
 def describe(table: ImageTable, *, repeats: int = REPEATS, seed: int = SEED) -> dict[str, Any]:
@@ -200,34 +173,25 @@ def _differences(
 ) -> dict[str, Difference]:
     before, after = (summarise(table, **options) for table in (a, b))
     differences = {}
-    for name in before:
-        if name in after:
-            scenes = min(draws_a.scenes[name], draws_b.scenes[name])
-            low, high = interval_of(draws_b.metrics[name] - draws_a.metrics[name], scenes)
-            differences[name] = Difference(after[name] - before[name], low, high)
+    for name in (name for name in before if name in after):
+        scenes = min(draws_a.scenes[name], draws_b.scenes[name])
+        interval = interval_of(draws_b.metrics[name] - draws_a.metrics[name], scenes)
+        differences[name] = Difference(after[name] - before[name], *interval)
     return differences
 
 
 @cache
 def student_quantile(freedom: int, *, level: float = LEVEL) -> float:
-    """Return the t of Student's distribution for which [-t, t] has probability ``level``.
-
-    Args:
-        freedom: degrees of freedom, at least 1.
-        level: between 0 and 1.
-    """
+    """Return the t of Student's distribution, of ``freedom`` >= 1, for which [-t, t] has probability ``level``."""
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, 0.5 + level / 2))
 
 
 def interval_of(values: Floats, scenes: int) -> tuple[float, float]:
-    """Return the expanded percentile interval of draws.
+    """Return the expanded percentile interval of draws, [repeats]; NaN if ``scenes``, which define it, are too few.
 
-    Args:
-        values: [repeats] a metric, or a difference, of the drawn sets; those that are NaN because no image defines
-            the metric are left out.
-        scenes: how many scenes define it; fewer than :data:`MIN_SCENES` give NaN.
+    Draws that are NaN, because no image defines the metric, are left out.
     """
     values = values[~np.isnan(values)]
     if scenes < MIN_SCENES or not values.size:

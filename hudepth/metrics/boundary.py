@@ -33,15 +33,9 @@ BOUNDARY_NAMES = (
 
 
 def boundary_metrics(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float64[Tensor, " b"]]:
-    """All measures of this file with their published settings.
+    """All measures of this file with their published settings, by the names and in the order of :data:`BOUNDARY_NAMES`.
 
-    Args:
-        pred_m: predicted depth [m], finite where valid.
-        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: True where the ground truth is measured.
-
-    Returns:
-        The measures named in :data:`BOUNDARY_NAMES`, in that order; NaN where the ground truth has no such edge.
+    ``pred_m`` [m] is finite where valid, ``target_m`` [m] positive. NaN where the ground truth has no such edge.
     """
     slopes = _squared_slopes(pred_m, target_m, valid)
     values: dict[str, Tensor] = {}
@@ -56,21 +50,12 @@ def boundary_metrics(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[
 def edge_scores(
     pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, threshold: float
 ) -> dict[str, Float64[Tensor, " b"]]:
-    """Precision, recall and F1 of predicted edge pixels (Hu et al. 2019).
+    """Precision, recall and F1 = 2 hits / (predicted + true) of predicted edge pixels, in [0, 1] (Hu et al. 2019).
 
-    An edge pixel is one where sqrt(fx^2 + fy^2) > threshold, fx and fy the plain 3 x 3 Sobel sums of depth in
+    An edge pixel is one where sqrt(fx^2 + fy^2) > threshold [m], fx and fy the plain 3 x 3 Sobel sums of depth in
     metres (weights 1 2 1, not divided by 8): a step of s metres along an axis gives 4 s, so the thresholds 0.25, 0.5
-    and 1 find steps above 6, 12.5 and 25 cm. Only pixels whose whole 3 x 3 window lies in the image and is valid
-    count; the authors' code pads with zeros, which makes the image's border an edge in both maps.
-
-    Args:
-        pred_m: as in :func:`boundary_metrics`, like ``target_m`` and ``valid``.
-        target_m: see there.
-        valid: see there.
-        threshold: the Sobel magnitude [m] above which a pixel is an edge.
-
-    Returns:
-        ``precision``, ``recall`` and ``f1`` = 2 hits / (predicted + true), in [0, 1].
+    and 1 find steps above 6, 12.5 and 25 cm. Only pixels whose whole 3 x 3 window lies in the image and is valid count;
+    the authors' code pads with zeros, which makes the image's border an edge in both maps.
     """
     return _edge_scores(*_squared_slopes(pred_m, target_m, valid), threshold)
 
@@ -96,16 +81,6 @@ def si_boundary_f1(
     score below 1. Here a direction counts for recall if the ground truth has occlusions, for precision if either has,
     and a threshold counts if the ground truth has. With all directions at all thresholds both agree.
 
-    Args:
-        pred_m: as in :func:`boundary_metrics`, but only up to a factor.
-        target_m: see there.
-        valid: see there.
-        min_ratio: least threshold, at least 1.
-        max_ratio: largest threshold.
-        steps: how many thresholds.
-
-    Returns:
-        Values in [0, 1].
     """
     ratios = torch.linspace(min_ratio, max_ratio, steps, dtype=torch.float64, device=pred_m.device)
     pred, target = (torch.where(valid, full_precision(x).clamp_min(MIN_DEPTH_M), 1.0) for x in (pred_m, target_m))
@@ -142,17 +117,8 @@ def depth_boundary_errors(
     Invalid pixels have no weight in the Gaussian, and no gradient is taken across them. Edges within 2 pixels of one
     are dropped: they may be ends of the measured area.
 
-    Args:
-        pred_m: as in :func:`boundary_metrics`, like ``target_m`` and ``valid``.
-        target_m: see there.
-        valid: see there.
-        sigma_px: standard deviation of the Gaussian.
-        low: Sobel magnitude, of depth in [0, 1], down to which an edge is followed.
-        high: Sobel magnitude above which an edge begins.
-        reach_px: distance from which an edge counts as missed.
-
-    Returns:
-        ``acc_px`` and ``comp_px`` in [0, reach_px], on ``pred_m``'s device, though computed on the CPU.
+    An edge begins above the Sobel magnitude ``high``, of depth in [0, 1], and is followed down to ``low``. Both
+    distances are in [0, reach_px], on ``pred_m``'s device, though computed on the CPU.
     """
     rows = []
     maps = (x.detach().squeeze(1).float().cpu().numpy() for x in (pred_m, target_m))

@@ -67,12 +67,7 @@ _FUNCTIONS: dict[str, Function] = {}
 
 
 def register(info: MetricInfo, function: Function | None = None) -> None:
-    """Add a metric, or replace it.
-
-    Args:
-        info: facts about it.
-        function: computes it for each image of a batch; None for metrics that hudepth computes elsewhere.
-    """
+    """Add a metric, or replace it; ``function`` computes it for each image (None: hudepth computes it elsewhere)."""
     if function is not None:
         _FUNCTIONS[info.name] = function
         info = replace(info, pool="images")
@@ -120,12 +115,7 @@ def metric_info(name: str) -> MetricInfo:
 
 
 def metric_names(shown: Level, *, among: Iterable[str] | None = None) -> list[str]:
-    """Return the metrics of a table, in its order.
-
-    Args:
-        shown: width of the table.
-        among: only these; default: all.
-    """
+    """Return the metrics of a table, in its order; only those ``among``, if given."""
     levels = next((level[: level.index(shown) + 1] for level in LEVELS if shown in level), (shown,))
     names = [name for name, info in _CATALOGUE.items() if info.shown in levels]
     return names if among is None else [name for name in names if name in set(among)]

@@ -55,13 +55,7 @@ class DepthMetrics(Metric):
         self.add_state("images", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
     def update(self, pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> None:
-        """Add a batch. Images without a valid pixel are skipped.
-
-        Args:
-            pred_m: predicted depth [m].
-            target_m: ground-truth depth [m], positive where valid.
-            valid: True where the ground truth is measured.
-        """
+        """Add a batch of depths [m], ``target_m`` positive where valid; images without a valid pixel are skipped."""
         sums = depth_sums(pred_m, target_m, valid)
         rows = sums if self.averaging == "pooled" else self._finish(sums)
         measured = sums["count"] > 0
@@ -143,15 +137,7 @@ class MAE(DepthMetric):
 
 
 class Delta(DepthMetric):
-    """Share of pixels with ``max(pred / target, target / pred) < 1.25^power``.
-
-    Args:
-        power: 1, 2 or 3.
-        kwargs: as for :class:`DepthMetrics`.
-
-    Raises:
-        ConfigError: for another power.
-    """
+    """Share of pixels with ``max(pred / target, target / pred) < 1.25^power``; ``power`` is 1, 2 or 3."""
 
     name = "delta1"
 
@@ -192,14 +178,8 @@ class ImageMetric(Metric, ABC):
 class DepthSSIM(ImageMetric):
     """Mean over images of :func:`hudepth.metrics.ssim.ssim`, with its window of 11 x 11 and sigma 1.5.
 
-    Images without a window of valid pixels are skipped; images smaller than the window are a :class:`ConfigError`.
-
-    Args:
-        data_range: the span of possible depths [m], normally ``max_depth_m``; positive.
-        kwargs: as for :class:`torchmetrics.Metric`.
-
-    Raises:
-        ConfigError: if ``data_range`` is not positive.
+    ``data_range`` is the span of possible depths [m], normally ``max_depth_m``. Images without a window of valid pixels
+    are skipped. Raises ConfigError if ``data_range`` is not positive or images are smaller than the window.
     """
 
     higher_is_better = True

@@ -30,11 +30,7 @@ _Size = Annotated[Sequence[int], Range(1), "[height,width]"]
 
 @dataclass(frozen=True)
 class Protocol:
-    """How predictions are scored.
-
-    Raises:
-        ConfigError: for values out of range.
-    """
+    """How predictions are scored; raises :class:`ConfigError` for values out of range."""
 
     name: str
     resolution: Annotated[str, Choice(("network", "native"))] = "network"
@@ -60,7 +56,6 @@ class Protocol:
     clamp: bool = False
     """Clamp predictions to [min_depth_m, max_depth_m], after alignment."""
     averaging: Annotated[str, Choice(get_args(Averaging))] = "image"
-    """One of :data:`hudepth.metrics.collection.Averaging`."""
     silog_lambda: Annotated[float, Range(0, 1)] = 1.0
     silog_factor: float = 100.0
     ssim_data_range_m: _Positive = 10.0
@@ -151,14 +146,13 @@ class Protocol:
         }
 
     def _valid_rule(self) -> str:
-        less = "<" if self.valid == "open" else "<="
         if self.valid == "measured":
             return "measured"
+        less = "<" if self.valid == "open" else "<="
         upper = "" if self.max_depth_m is None else f" {less} {self.max_depth_m:.15g} m"
         return f"measured, {self.min_depth_m:.15g} m {less} truth{upper}"
 
 
 def _is_crop(crop: Sequence[int], size: Sequence[int] | None) -> bool:
-    if not (len(crop) == 4 and crop[0] < crop[1] and crop[2] < crop[3]):
-        return False
-    return size is None or (crop[1] <= size[0] and crop[3] <= size[1])
+    ordered = len(crop) == 4 and crop[0] < crop[1] and crop[2] < crop[3]
+    return ordered and (size is None or (crop[1] <= size[0] and crop[3] <= size[1]))

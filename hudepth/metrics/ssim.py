@@ -34,21 +34,10 @@ def ssim_map(
     k1: float = 0.01,
     k2: float = 0.03,
 ) -> Float[Tensor, "b 1 rows columns"]:
-    """SSIM of each window, rows = h - window + 1, columns = w - window + 1.
+    """SSIM of each window, rows = h - window + 1, columns = w - window + 1; both maps and ``data_range`` in one unit.
 
-    Computed in float32 (float64 for float64) whatever autocast says: bfloat16 is off by 2e-3.
-
-    Args:
-        pred: predicted depth, in any unit.
-        target: ground-truth depth, in the same unit.
-        data_range: L, the span of possible values in that unit.
-        window: side of the Gaussian window in pixels.
-        sigma: its standard deviation in pixels.
-        k1: stabilises the means, relative to L.
-        k2: stabilises the variances, relative to L.
-
-    Raises:
-        ConfigError: if the images are smaller than the window.
+    Computed in float32 (float64 for float64) whatever autocast says: bfloat16 is off by 2e-3. Window and sigma are in
+    pixels. Raises ConfigError if the images are smaller than the window.
     """
     _check_size(pred, window)
     with torch.autocast(pred.device.type, enabled=False):
@@ -76,9 +65,10 @@ def ssim(
     k1: float = 0.01,
     k2: float = 0.03,
 ) -> Float[Tensor, " b"]:
-    """Mean of :func:`ssim_map` over the windows whose pixels are all valid; NaN for an image without one.
+    """Mean of :func:`ssim_map` over the windows whose pixels are all ``valid`` (None: all); NaN for an image without
+    one.
 
-    Arguments and errors are those of :func:`ssim_map`; ``valid``: where the ground truth is measured (None: all).
+    Further arguments and errors are those of :func:`ssim_map`.
     """
     if valid is None:
         valid = torch.ones_like(target, dtype=torch.bool)
@@ -97,10 +87,7 @@ def ssim_sums(
     k1: float = 0.01,
     k2: float = 0.03,
 ) -> tuple[Float64[Tensor, " b"], Int64[Tensor, " b"]]:
-    """Sum of :func:`ssim_map` over each image's windows whose pixels are all valid, and how many there are.
-
-    Arguments and errors are those of :func:`ssim_map`; ``valid`` is True where the ground truth is measured.
-    """
+    """Sum of :func:`ssim_map` over each image's windows whose pixels are all valid, and how many there are."""
     pred, target = torch.where(valid, pred, 0.0), torch.where(valid, target, 0.0)
     values = ssim_map(pred, target, data_range=data_range, window=window, sigma=sigma, k1=k1, k2=k2)
     whole = whole_windows(valid, window)

@@ -1,7 +1,7 @@
 """Where a depth network errs: by depth, by distance to a depth edge, by image region, by scene category.
 
-Each group parts the valid pixels of an image; sums over a bin add up over images, and metrics of a bin are pooled over
-its pixels.
+Each group parts the valid pixels of an image; sums over a bin add up over images, and metrics are pooled over its
+pixels.
 """
 
 from __future__ import annotations
@@ -49,12 +49,11 @@ MAX_CATEGORIES = 12
 _SIZES = (len(DEPTH_EDGES_M) + 1, len(EDGE_DISTANCES_PX) + 1, 9)
 """Bins of each group."""
 _CELLS = math.prod(_SIZES)
-"""Combinations of a bin of each group."""
 
 
 @dataclass(frozen=True)
 class Stratum:
-    """Metrics of a network on a part of the pixels."""
+    """Metrics of a network on a part of the pixels; rmse and mae in metres."""
 
     group: str
     label: str
@@ -64,23 +63,12 @@ class Stratum:
     """Of the group's pixels, in [0, 1]."""
     abs_rel: float
     rmse: float
-    """[m]"""
     mae: float
-    """[m]"""
     delta1: float
 
 
 def strata_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float64[Tensor, "b bins 5"]:
-    """Sum errors over each bin of :data:`STRATA`, image by image.
-
-    Args:
-        pred_m: predicted depth [m].
-        target_m: ground-truth depth [m], positive where valid; ignored elsewhere.
-        valid: which pixels count.
-
-    Returns:
-        Columns as in :data:`STRATUM_SUMS`.
-    """
+    """Sum errors of depths [m] over each bin of :data:`STRATA`, image by image; columns as in :data:`STRATUM_SUMS`."""
     pred, target = (torch.where(valid, full_precision(x), 1.0) for x in (pred_m, target_m))
     error = (pred - target).abs()
     positive = pred.clamp_min(MIN_DEPTH_M)
@@ -122,10 +110,7 @@ def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> 
     :data:`EDGE_RATIO`. Infinite if the image has no edge, which puts it in the last bin.
     """
     edge = np.zeros(depth_m.shape, np.bool_)
-    for a, b in (
-        ((slice(1, None),), (slice(None, -1),)),
-        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-    ):
+    for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         step = ((depth_m[a] > EDGE_RATIO * depth_m[b]) | (depth_m[b] > EDGE_RATIO * depth_m[a])) & valid[a] & valid[b]
         edge[a] |= step
         edge[b] |= step
@@ -135,15 +120,11 @@ def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> 
 
 
 def summarise_strata(sums: Float64[Tensor, "n bins 5"], categories: Sequence[str]) -> list[Stratum]:
-    """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels.
+    """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels; bins without a pixel are
+    left out.
 
-    Args:
-        sums: of :func:`strata_sums`, one row per image.
-        categories: kind of scene of each image, empty where unknown.
-
-    Returns:
-        Bins without a pixel are left out. The group ``category`` comes last, if any category is known: at most
-        :data:`MAX_CATEGORIES`, most pixels first, the rest as ``other``.
+    ``categories``: kind of scene of each image, empty where unknown. If any is known, the group ``category`` comes
+    last: at most :data:`MAX_CATEGORIES`, most pixels first, the rest as ``other``.
     """
     rows = [(*STRATA[i], sums[:, i]) for i in range(len(STRATA))]
     if any(categories):

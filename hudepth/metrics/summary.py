@@ -37,17 +37,16 @@ KEYS = ("id", "scene", "category", "pixels")
 
 @dataclass(frozen=True)
 class ImageTable:
-    """Metrics of each image of a set, one row per image."""
+    """Metrics of each image of a set, one row per image; NaN where undefined."""
 
     ids: list[str]
-    """Unique."""
     scenes: list[str]
     """Empty if the data set has none."""
     categories: list[str]
     pixels: NDArray[np.int64]
     """[n] pixels that count."""
     values: dict[str, Floats]
-    """[n] by metric; NaN where undefined."""
+    """[n] by metric."""
 
 
 class SummaryOptions(TypedDict):
@@ -63,16 +62,10 @@ class SummaryOptions(TypedDict):
 
 
 def summarise(table: ImageTable, **options: Unpack[SummaryOptions]) -> dict[str, float]:
-    """Return the metrics of all images of a table together.
+    """Return the metrics of all images of a table together, without ``log_bias``.
 
-    Args:
-        table: of the images.
-        **options: see :class:`SummaryOptions`.
-
-    Returns:
-        The metrics of the table, without ``log_bias``; pooled silog only if the table has ``log_bias``. Images without
-        a pixel that counts are skipped. NaN where a prediction was NaN (skipping it would flatter), and where a metric
-        is defined for no image.
+    Pooled silog only if the table has ``log_bias``. Images without a pixel that counts are skipped. NaN where a
+    prediction was NaN (skipping it would flatter), and where a metric is defined for no image.
     """
     columns = additive(table, averaging=options["averaging"])
     metrics = metrics_from_sums({name: x.sum(axis=1, keepdims=True) for name, x in columns.items()}, **options)
@@ -120,11 +113,7 @@ def per_image_csv(table: ImageTable) -> str:
 
 
 def read_per_image(path: Path) -> ImageTable:
-    """Read the output of :func:`per_image_csv`.
-
-    Raises:
-        DataError: if the file is missing or damaged; the message names file and line.
-    """
+    """Read the output of :func:`per_image_csv`; raises DataError, with file and line, if it is missing or damaged."""
     again = "Run hudepth-test again."
     rows: dict[str, list[str]] = {}
     numbers: list[list[float]] = []
@@ -147,26 +136,19 @@ def read_per_image(path: Path) -> ImageTable:
     if not rows:
         raise DataError(f"'{path}' contains no image. {again}")
     ids, scenes, categories, pixels = (list(column) for column in zip(*rows.values(), strict=True))
-    return ImageTable(
-        ids=ids,
-        scenes=scenes,
-        categories=categories,
-        pixels=np.array([int(count) for count in pixels], dtype=np.int64),
-        values=dict(zip(names[len(KEYS) :], np.ascontiguousarray(np.array(numbers).T), strict=True)),
-    )
+    counts = np.array([int(count) for count in pixels], dtype=np.int64)
+    values = dict(zip(names[len(KEYS) :], np.ascontiguousarray(np.array(numbers).T), strict=True))
+    return ImageTable(ids, scenes, categories, counts, values)
 
 
 def _numbers(cells: list[str], names: list[str], *, where: str, fix: str) -> list[float]:
-    """Convert a row at once: a report may read hundreds of thousands of rows."""
+    """Convert a row."""
     if not cells[3].isascii() or not cells[3].isdigit() or len(cells[3]) > 18:  # what 64 bits hold
         raise DataError(f"{where}: pixels '{cells[3]}' is not a count. {fix}")
+    numbers: list[float] = []
     try:
-        return [float(cell) for cell in cells[len(KEYS) :]]
-    except ValueError as error:
-        found = error
-    for name, cell in zip(names[len(KEYS) :], cells[len(KEYS) :], strict=True):
-        try:
-            float(cell)
-        except ValueError:
-            raise DataError(f"{where}: {name} '{cell}' is not a number. {fix}") from None
-    raise found
+        numbers.extend(map(float, cells[len(KEYS) :]))  # at once: a report may read hundreds of thousands of rows
+    except ValueError:
+        at = len(KEYS) + len(numbers)
+        raise DataError(f"{where}: {names[at]} '{cells[at]}' is not a number. {fix}") from None
+    return numbers

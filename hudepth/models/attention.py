@@ -15,18 +15,10 @@ from hudepth.models.options import ACTIVATIONS, choose
 
 
 def sine_positions(channels: int, height: int, width: int) -> Float[Tensor, "c h w"]:
-    """Return sines and cosines of row and column, each over half the channels (Carion et al. 2020, DETR).
+    """Return sines and cosines of row and column, each over half the channels (Carion et al. 2020, DETR), in float64.
 
     Half of each half are sines, half cosines, of angles that fall geometrically from 1 to 1/10000 per pixel (Vaswani et
-    al. 2017).
-
-    Args:
-        channels: a multiple of 4.
-        height: rows.
-        width: columns.
-
-    Returns:
-        In float64, to be exact in whatever it is added to.
+    al. 2017). ``channels``: a multiple of 4.
     """
     count = channels // 4
     frequency = torch.exp(torch.arange(count, dtype=torch.float64) * (-math.log(10_000) / count))[:, None]
@@ -37,17 +29,15 @@ def sine_positions(channels: int, height: int, width: int) -> Float[Tensor, "c h
 
 
 class TransformerBlock(nn.Module):
-    """Post-norm self-attention: x = LN(x + MHA(x)); x = LN(x + FFN(x)).
-
-    The positions of the map are the tokens.
+    """Post-norm self-attention over the positions of a map: x = LN(x + MHA(x)); x = LN(x + FFN(x)).
 
     Args:
         channels: width of a token.
         heads: attention heads; must divide ``channels``. The paper does not state it.
         expansion: width of the feed-forward layer over that of a token (table A1: 4).
         activation: of the feed-forward layer: relu, gelu or silu. The paper does not state it.
-        positions: position encoding: "none" (figure 4 shows nothing), or "sine", which is added to queries and keys
-            and needs a multiple of 4 channels. Neither has parameters: table A1 counts none.
+        positions: "none" (figure 4 shows no encoding), or "sine", which is added to queries and keys and needs a
+            multiple of 4 channels. Neither has parameters: table A1 counts none.
 
     Raises:
         ConfigError: if ``heads`` does not divide ``channels``, or the activation or the encoding is unknown.

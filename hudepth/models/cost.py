@@ -13,12 +13,9 @@ from torch.utils.flop_counter import FlopCounterMode
 def counted_flops(network: nn.Module, image: Tensor) -> int:
     """Return the FLOPs of one forward pass as PyTorch's own counter sees them.
 
-    Two fused paths of attention escape the counter, so both are kept out: that of ``nn.MultiheadAttention`` by leaving
-    gradients on, that of ``scaled_dot_product_attention`` by its plain backend.
-
-    Args:
-        network: in any mode, with parameters that require gradients; on the meta device nothing is computed.
-        image: [b, 3, h, w] on the network's device.
+    The network's parameters must require gradients: two fused paths of attention escape the counter, that of
+    ``nn.MultiheadAttention`` without gradients, that of ``scaled_dot_product_attention`` with any backend but the plain
+    one. On the meta device nothing is computed.
     """
     with torch.enable_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         network(image)
@@ -26,11 +23,8 @@ def counted_flops(network: nn.Module, image: Tensor) -> int:
 
 
 def image_flops(network: nn.Module, size: tuple[int, int]) -> int:
-    """Return the FLOPs of one image by :func:`counted_flops`, without computing anything.
-
-    Args:
-        network: in any form, frozen or not; it is not changed.
-        size: (height, width) of the image.
+    """Return the FLOPs of one image of (height, width) by :func:`counted_flops`, without computing or changing
+    anything.
     """
     weightless = copy.deepcopy(network).to("meta").requires_grad_(requires_grad=True)
     return counted_flops(weightless, torch.empty(1, 3, *size, device="meta"))

@@ -25,15 +25,8 @@ Arithmetic = Literal["plain", "merged"]
 class UpBlock(nn.Module):
     """x2 upsampling, concatenation with the skip, then twice (3x3 convolution with bias, batch norm, ReLU).
 
-    Args:
-        channels_in: of the coarse map.
-        channels_skip: of the skip, which has twice the coarse map's size.
-        channels_out: of the result.
-        upsample: ``nearest`` (the default of figure 4's UpSampling2D) or ``bilinear``.
-        arithmetic: ``plain`` or ``merged``; bilinear upsampling is always ``plain``.
-
-    Raises:
-        ConfigError: for an unknown option.
+    ``upsample`` is ``nearest`` (the default of figure 4's UpSampling2D) or ``bilinear``; ``arithmetic`` is ``plain`` or
+    ``merged``, but bilinear upsampling is always ``plain``. Raises ConfigError for an unknown option.
     """
 
     def __init__(
@@ -84,14 +77,9 @@ def split_kernel(
 
     Doubled by nearest neighbour and then convolved by 3 x 3, each output pixel sees only 2 x 2 different pixels of the
     coarse map: a transposed convolution of 4 x 4 with stride 2, with 4/9 of the multiplications. The concatenation
-    becomes a sum of two convolutions.
+    becomes a sum of two convolutions. The first ``channels_in`` input channels are the coarse map's.
 
-    Args:
-        weight: of the convolution.
-        channels_in: how many of its input channels are the coarse map's; they come first.
-
-    Returns:
-        The kernel of the transposed convolution (stride 2, padding 1) and that of the skip's convolution (padding 1).
+    Returns the kernel of the transposed convolution (stride 2, padding 1) and that of the skip's (padding 1).
     """
     coarse = weight[:, :channels_in]
     for dim in (2, 3):
@@ -108,12 +96,9 @@ def joint_head(
 ) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
     """Join a transposed convolution (stride 2, padding 1) and the 3 x 3 convolution to one channel that follows it.
 
-    Each 2 x 2 square of the result is a linear function of 3 x 3 pixels of the input: a convolution to 4 channels,
-    which :func:`torch.nn.functional.pixel_shuffle` lays out as squares. Right everywhere but on the outermost pixels,
-    where the original pads what lies between the two steps.
-
-    Returns:
-        Kernel and bias of the joint convolution (padding 1).
+    Each 2 x 2 square of the result is a linear function of 3 x 3 pixels of the input: a convolution to 4 channels
+    (padding 1), which :func:`torch.nn.functional.pixel_shuffle` lays out as squares. Right everywhere but on the
+    outermost pixels, where the original pads what lies between the two steps. Returns its kernel and bias.
     """
     # output pixel 2 i + phase, of input pixel i + t, goes through tap m = phase + 2 - 2 t of the joint kernel
     joint = up_weight.new_zeros(len(up_weight), 6, 6)
@@ -127,13 +112,9 @@ def joint_head(
 
 
 class Head(nn.Module):
-    """x2 upsampling by a transposed convolution, then a 3x3 convolution.
+    """x2 upsampling to ``width`` channels by a transposed convolution, then a 3x3 convolution.
 
-    Args:
-        channels_in: of the last up block.
-        channels_out: of the result.
-        width: channels between the two steps.
-        arithmetic: ``plain`` or ``merged``; several output channels are always ``plain``.
+    ``arithmetic`` is ``plain`` or ``merged``; several output channels are always ``plain``.
     """
 
     def __init__(self, channels_in: int, channels_out: int = 1, *, width: int = 32, arithmetic: str = "plain") -> None:
@@ -164,12 +145,7 @@ class Head(nn.Module):
         return joint_head(*(part.double() if double else part for part in parts))
 
     def run_joint(self, x: Float[Tensor, "b c h w"], joint: tuple[Tensor, Tensor]) -> Float[Tensor, "b 1 2*h 2*w"]:
-        """Run the joint convolution, and the two steps along the border, on strips of two pixels.
-
-        Args:
-            x: the last up block's map.
-            joint: of :func:`joint_head`.
-        """
+        """Run the convolution of :func:`joint_head`, and the two steps along the border, on strips of two pixels."""
         inside = functional.pixel_shuffle(functional.conv2d(x, *joint, padding=1), 2)[:, :, 1:-1, 1:-1]
         top, bottom = self.steps(x[:, :, :2])[:, :, :1], self.steps(x[:, :, -2:])[:, :, -1:]
         left, right = self.steps(x[..., :2])[:, :, 1:-1, :1], self.steps(x[..., -2:])[:, :, 1:-1, -1:]

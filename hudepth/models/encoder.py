@@ -1,7 +1,4 @@
-"""The interface of image encoders: stages with channels and strides, and a pretrained start.
-
-Networks, optimisers and callbacks use it, so that an encoder of your own needs no changes elsewhere.
-"""
+"""The interface of image encoders; networks, optimisers and callbacks use nothing else of them."""
 
 from __future__ import annotations
 
@@ -38,32 +35,20 @@ class Encoder(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def from_pretrained(cls, weights: str | None, **options: Any) -> Encoder:
-        """Build an encoder and load pretrained weights.
+        """Build an encoder and load weights: a name or path that it knows, or None or ``none`` for random values.
 
-        Args:
-            weights: a name or path that the encoder knows; None or ``none`` for random values.
-            **options: of the encoder.
-
-        Raises:
-            CheckpointError: if the weights are missing or do not fit.
+        Raises CheckpointError if the weights are missing or do not fit.
         """
 
     @abstractmethod
     def forward(self, image: Float[Tensor, "b 3 h w"], *, run: Callable[..., Any] = run_stage) -> list[Tensor]:
-        """Return the feature map of each stage, finest first.
+        """Return the feature map of each stage, finest first, of images normalised with ImageNet's statistics.
 
-        Args:
-            image: RGB, normalised with ImageNet's statistics.
-            run: runs a stage, for example :func:`hudepth.models.recompute.recomputed`.
+        ``run`` runs a stage, for example :func:`hudepth.models.recompute.recomputed`.
         """
 
     def freeze(self, stages: int, *, frozen: bool = True) -> None:
-        """Stop or resume training the first stages.
-
-        Args:
-            stages: how many.
-            frozen: False to train them again.
-        """
+        """Stop training the first stages, or train them again."""
         for name in (name for stage in self.stages[:stages] for name in stage.modules):
             getattr(self, name).requires_grad_(requires_grad=not frozen)
 

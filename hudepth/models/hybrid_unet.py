@@ -27,16 +27,11 @@ class HybridUNet(UNet):
     Args:
         weights: of the encoder: ``imagenet``, a path, or ``none`` (see :class:`ResNet18Encoder`).
         attention: transformer blocks on ``none``, ``skip``, ``deepest`` or ``both`` (table A1).
-        attention_heads: heads of each block (not stated in the paper).
-        attention_activation: relu, gelu or silu inside each block (not stated).
-        attention_positions: ``none`` (figure 4 shows nothing) or ``sine``, added to each block's queries and keys.
-        upsample: ``nearest`` (figure 4 says UpSampling2D, whose default it is) or ``bilinear``.
-        output: from the last convolution to unit depth, one of :data:`hudepth.models.options.OUTPUTS` (not stated).
+        attention_heads, attention_activation, attention_positions: see :class:`TransformerBlock` (not stated).
+        upsample, output, recompute: see :class:`UNet`.
         arithmetic: ``plain``, or ``merged``: linear steps as one, with a fifth fewer multiplications and the same
             results up to rounding (:mod:`hudepth.models.decoder`).
         encoder_norm: batch norm of the encoder: ``trained``, or ``frozen`` to its initial statistics.
-        recompute: in training, recompute each stage's activations for the gradients instead of keeping them: less
-            memory for more time, the same results.
 
     Raises:
         ConfigError: for an unknown option.

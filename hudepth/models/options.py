@@ -62,9 +62,5 @@ OUTPUTS: Mapping[str, Callable[[], nn.Module]] = {
 
 
 def choose(key: str, name: str, choices: Mapping[str, T]) -> T:
-    """Return ``choices[name]``.
-
-    Raises:
-        ConfigError: if there is no such choice.
-    """
+    """Return ``choices[name]``; raises ConfigError if there is none."""
     return choices[convert(key, name, Annotated[str, Choice(tuple(choices))])]

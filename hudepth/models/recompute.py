@@ -14,10 +14,6 @@ def recomputed(module: nn.Module, *inputs: Any) -> Any:
     """Return ``module(*inputs)``, and keep of it only what the gradients cannot be computed without.
 
     The second pass leaves the statistics of batch norm alone, so that training goes exactly as it would have gone.
-
-    Args:
-        module: part of a network.
-        *inputs: of its forward.
     """
 
     def contexts() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:

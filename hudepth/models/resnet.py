@@ -55,15 +55,10 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18Encoder(Encoder):
-    """ResNet-18 without fc, and by default without layer4.
+    """ResNet-18 without fc: up to layer3 (``layers=3``, table A1) or to layer4 (``layers=4``, the paper's text).
 
-    Args:
-        layers: 3 ends with layer3 (table A1), 4 with layer4 (the paper's text).
-        norm: batch norm: ``trained``, or ``frozen``: normalise with the initial statistics, in training too. Scale and
-            shift are trained either way.
-
-    Raises:
-        ConfigError: for an unknown ``norm``.
+    ``norm``: batch norm is ``trained``, or ``frozen``: it normalises with the initial statistics, in training too;
+    scale and shift are trained either way. Raises ConfigError for another.
     """
 
     def __init__(self, *, layers: Literal[3, 4] = 3, norm: str = "trained") -> None:
@@ -130,15 +125,15 @@ class ResNet18Encoder(Encoder):
         without_layer4 = not any(name.startswith(LAYER4) for name in state)
         if without_layer4:
             state |= {name: value for name, value in own.items() if name.startswith(LAYER4)}
-        missing = sorted(own.keys() - state.keys())
-        unknown = sorted(state.keys() - own.keys())
-        misshapen = sorted(name for name in own.keys() & state.keys() if own[name].shape != state[name].shape)
-        for problem, names in (("missing", missing), ("unknown", unknown), ("of another shape", misshapen)):
+        misshapen = {name for name in own.keys() & state.keys() if own[name].shape != state[name].shape}
+        for problem, names in (
+            ("missing", own.keys() - state.keys()),
+            ("unknown", state.keys() - own.keys()),
+            ("of another shape", misshapen),
+        ):
             if names:
-                raise CheckpointError(
-                    f"model.weights: '{weights}' does not fit: {len(names)} tensors {problem}, the first is "
-                    f"'{names[0]}'. {_FIX}"
-                )
+                found = f"{len(names)} tensors {problem}, the first is '{min(names)}'"
+                raise CheckpointError(f"model.weights: '{weights}' does not fit: {found}. {_FIX}")
         self.load_state_dict(state)
         if has_layer4 and without_layer4:
             log.warning("model.weights: '%s' has no layer4, which starts at random", weights)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 from torch import Tensor, nn
@@ -24,18 +25,8 @@ class ResNet18UNet(UNet):
     back to 224 x 224. What it leaves open is as in table A1: the inside of transformer layers, up blocks and output
     layer, the skips (the four maps before the deepest), and decoder blocks as wide as their skips: 256, 128, 64, 64.
 
-    Args:
-        weights: of the encoder: ``imagenet``, a path, or ``none`` (see :class:`ResNet18Encoder`).
-        attention_layers: transformer blocks, one after another, on layer4's output; the text says 4.
-        attention_heads: heads of each block (not stated in the paper).
-        attention_activation: relu, gelu or silu inside each block (not stated).
-        attention_positions: ``none`` (figure 4 shows nothing) or ``sine``, added to each block's queries and keys.
-        upsample: ``nearest`` (figure 4 says UpSampling2D, whose default it is) or ``bilinear``.
-        output: from the last convolution to unit depth, one of :data:`hudepth.models.options.OUTPUTS` (not stated).
-
-    Raises:
-        ConfigError: for an unknown option or a negative number of layers.
-        CheckpointError: if the weights are missing or do not fit.
+    ``attention_layers``: transformer blocks, one after another, on layer4's output; the text says 4. Other options and
+    errors are those of :class:`hudepth.models.hybrid_unet.HybridUNet`.
     """
 
     attention: nn.Module
@@ -53,13 +44,10 @@ class ResNet18UNet(UNet):
     ) -> None:
         convert("model.attention_layers", attention_layers, Annotated[int, Range(0)], default=0)
         encoder = ResNet18Encoder.from_pretrained(weights, layers=4)
-        attention = nn.Sequential()
-        for _ in range(attention_layers):
-            attention.append(
-                TransformerBlock(
-                    512, heads=attention_heads, activation=attention_activation, positions=attention_positions
-                )
-            )
+        block = partial(
+            TransformerBlock, heads=attention_heads, activation=attention_activation, positions=attention_positions
+        )
+        attention = nn.Sequential(*(block(512) for _ in range(attention_layers)))
         super().__init__(encoder, attention=attention, upsample=upsample, output=output)
 
     def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:

@@ -11,11 +11,7 @@ STRIDE = 16
 
 
 class TinyUNet(nn.Module):
-    """A few thousand parameters with the hybrid UNet's interface: normalised RGB in, unit depth out.
-
-    Args:
-        channels: width of its only hidden layer.
-    """
+    """A few thousand parameters with the hybrid UNet's interface; ``channels``: width of its only hidden layer."""
 
     def __init__(self, *, channels: int = 8) -> None:
         super().__init__()
@@ -26,11 +22,7 @@ class TinyUNet(nn.Module):
         self.output = nn.Sigmoid()
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Predict unit depth in [0, 1].
-
-        Raises:
-            ConfigError: if a side of the image is not a multiple of 16.
-        """
+        """Predict unit depth in [0, 1]; raises ConfigError if a side of the image is not a multiple of 16."""
         check_size(*image.shape[-2:], stride=STRIDE)
         unit_depth: Tensor = self.output(self.decode(self.relu(self.norm(self.encode(image)))))
         return unit_depth

@@ -57,25 +57,17 @@ class UNet(nn.Module):
         self.output = final
 
     def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:
-        """Return the encoder's feature maps, finest first, as the decoder takes them.
-
-        Args:
-            features: of the encoder.
-            run: runs a module, as in :meth:`hudepth.models.encoder.Encoder.forward`.
+        """Return the encoder's feature maps, finest first, as the decoder takes them; ``run`` is as in
+        :meth:`Encoder.forward`.
         """
         raise NotImplementedError
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Predict unit depth.
+        """Predict depth / max_depth_m, in [0, 1] with the sigmoid output, from images normalised with ImageNet's
+        statistics.
 
-        Args:
-            image: RGB, normalised with ImageNet's statistics; both sides multiples of the deepest stage's stride.
-
-        Returns:
-            Depth / max_depth_m, in [0, 1] with the sigmoid output.
-
-        Raises:
-            ConfigError: if a side is not such a multiple; the message gives the nearest sizes that are.
+        Raises ConfigError if a side is not a multiple of the deepest stage's stride; the message gives the nearest
+        sizes that are.
         """
         check_size(*image.shape[-2:], stride=self.encoder.stages[-1].stride)
         run = recomputed if self.recompute and self.training else run_stage
@@ -87,15 +79,10 @@ class UNet(nn.Module):
 
 
 def check_size(height: int, width: int, *, stride: int) -> None:
-    """Check that a network can take images of this size.
+    """Check that a network of this stride [pixels of the image per position of its deepest map] takes images of this
+    size.
 
-    Args:
-        height: of the images [pixels].
-        width: of the images [pixels].
-        stride: pixels of the image per position of the network's deepest map, along each side.
-
-    Raises:
-        ConfigError: if a side is not a positive multiple of ``stride``; the message gives the nearest sizes that are.
+    Raises ConfigError if a side is not a positive multiple of ``stride``; the message gives the nearest sizes that are.
     """
     if height < stride or width < stride or height % stride or width % stride:
         below = [max(stride, side // stride * stride) for side in (height, width)]
