@@ -90,8 +90,8 @@ def smoothness_loss(
 def scaling_factor(
     pred: DepthMap, target: DepthMap, valid: Mask, *, per: str = "image", eps: float = 1e-8
 ) -> Float[Tensor, "n 1 1 1"]:
-    """The factor s = sum D / (sum D^ + eps) of equation 5, over valid pixels, for each "image" (n = b) or the "batch"
-    (n = 1).
+    """The factor s = sum D / (sum D^ + eps) of equation 5, over the valid pixels of each "image" or of the "batch" (n =
+    1).
 
     A negative sum of predictions, which unit depth cannot have, counts as 0: s stays finite and not negative. Raises
     ConfigError if ``per`` is neither "image" nor "batch".
@@ -113,12 +113,8 @@ def scaling_loss(
 ) -> Float[Tensor, ""]:
     """Mean over valid pixels of an error that is scaled by s (equation 4; see :func:`scaling_factor`), on unit depth.
 
-    Args:
-        mode: "weight": s |D^ - D|, as printed; "align": |s D^ - D|, the usual alignment of scale.
-        gradient: "flow" through s, or "stop" there.
-
-    Raises:
-        ConfigError: if an option is unknown.
+    ``mode`` is "weight": s |D^ - D|, as printed; or "align": |s D^ - D|, the usual alignment of scale. ``gradient`` is
+    "flow" through s, or "stop" there. Raises ConfigError if an option is unknown.
     """
     check_choices(scale_mode=mode, scale_gradient=gradient)
     factor = scaling_factor(pred, target, valid, per=per, eps=eps)

@@ -60,9 +60,7 @@ class Draws:
 
 
 class Resampler:
-    """Draws of scenes, made once for all tables of the same images; one whose scene is empty counts as a scene of its
-    own.
-    """
+    """Draws of scenes, made once for all tables of the same images; without a name an image is its own scene."""
 
     def __init__(self, table: ImageTable, *, repeats: int = REPEATS, seed: int | Sequence[int] = SEED) -> None:
         self._scene, self._counted = _scenes(table)
@@ -102,9 +100,8 @@ def bootstrap(
 ) -> dict[str, Floats]:
     """Return the metrics of resampled sets, [repeats] by name; tables of the same images get the same draws.
 
-    An image whose scene is empty counts as a scene of its own. ``options`` are those of
-    :func:`~hudepth.metrics.summary.summarise`. NaN where a prediction was NaN, and in draws without an image that
-    defines the metric.
+    An image whose scene is empty counts as a scene of its own. NaN where a prediction was NaN, and in draws without an
+    image that defines the metric.
     """
     return Resampler(table, repeats=repeats, seed=seed).draws(table, **options).metrics
 

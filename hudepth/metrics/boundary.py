@@ -80,7 +80,6 @@ def si_boundary_f1(
     The authors' code scores 0 for a direction or threshold without any occlusion, so that even the ground truth can
     score below 1. Here a direction counts for recall if the ground truth has occlusions, for precision if either has,
     and a threshold counts if the ground truth has. With all directions at all thresholds both agree.
-
     """
     ratios = torch.linspace(min_ratio, max_ratio, steps, dtype=torch.float64, device=pred_m.device)
     pred, target = (torch.where(valid, full_precision(x).clamp_min(MIN_DEPTH_M), 1.0) for x in (pred_m, target_m))

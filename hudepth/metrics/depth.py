@@ -58,11 +58,7 @@ class DepthMaps(NamedTuple):
     def sums(
         self, valid: Mask, *, masked: bool, rows: slice = slice(None), columns: slice = slice(None)
     ) -> dict[str, Float64[Tensor, " b"]]:
-        """Sum over the valid pixels of a crop.
-
-        ``valid`` holds none beyond those the maps were made with; ``masked`` if it is this very mask, which saves
-        applying it.
-        """
+        """Sum over the valid pixels of a crop; ``masked``: these are the very pixels that the maps were made with."""
         maps, valid = self.maps[..., rows, columns], valid[..., rows, columns]
         count = valid.flatten(1).sum(dim=1)
         if masked:
@@ -109,9 +105,7 @@ def depth_maps(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> DepthMaps:
 
 
 def depth_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float64[Tensor, " b"]]:
-    """Sum the terms of :func:`depth_maps` over each image's valid pixels, in float64, by the names of
-    :data:`SUM_NAMES`.
-    """
+    """Sum :func:`depth_maps` over each image's valid pixels, in float64, by the names of :data:`SUM_NAMES`."""
     return depth_maps(pred_m, target_m, valid).sums(valid, masked=True)
 
 

@@ -65,8 +65,7 @@ def ssim(
     k1: float = 0.01,
     k2: float = 0.03,
 ) -> Float[Tensor, " b"]:
-    """Mean of :func:`ssim_map` over the windows whose pixels are all ``valid`` (None: all); NaN for an image without
-    one.
+    """Mean of :func:`ssim_map` over windows whose pixels are all ``valid`` (None: all); NaN for an image without one.
 
     Further arguments and errors are those of :func:`ssim_map`.
     """

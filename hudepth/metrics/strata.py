@@ -120,8 +120,7 @@ def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> 
 
 
 def summarise_strata(sums: Float64[Tensor, "n bins 5"], categories: Sequence[str]) -> list[Stratum]:
-    """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels; bins without a pixel are
-    left out.
+    """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels; empty bins are left out.
 
     ``categories``: kind of scene of each image, empty where unknown. If any is known, the group ``category`` comes
     last: at most :data:`MAX_CATEGORIES`, most pixels first, the rest as ``other``.

@@ -23,9 +23,7 @@ def counted_flops(network: nn.Module, image: Tensor) -> int:
 
 
 def image_flops(network: nn.Module, size: tuple[int, int]) -> int:
-    """Return the FLOPs of one image of (height, width) by :func:`counted_flops`, without computing or changing
-    anything.
-    """
+    """Return the FLOPs of one image of (height, width) by :func:`counted_flops`, on the meta device."""
     weightless = copy.deepcopy(network).to("meta").requires_grad_(requires_grad=True)
     return counted_flops(weightless, torch.empty(1, 3, *size, device="meta"))
 

@@ -53,21 +53,17 @@ class UpBlock(nn.Module):
         self, x: Float[Tensor, "b c_in h w"], skip: Float[Tensor, "b c_skip h2 w2"]
     ) -> Float[Tensor, "b c_out h2 w2"]:
         """Return a map of the skip's size."""
-        x = self._merged_conv1(x, skip) if self.merged else self._plain_conv1(x, skip)
+        if self.merged:
+            coarse, fine = split_kernel(self.conv1.weight, channels_in=self.channels_in)
+            x = functional.conv_transpose2d(x, coarse, self.conv1.bias, stride=2, padding=1)
+            x = x + functional.conv2d(skip, fine, padding=1)
+        else:
+            align = {"align_corners": False} if self.upsample == "bilinear" else {}
+            x = functional.interpolate(x, scale_factor=2.0, mode=self.upsample, **align)
+            x = self.conv1(torch.cat([x, skip], dim=1))
         x = self.relu(self.bn1(x))
         x = self.relu(self.bn2(self.conv2(x)))
         return x
-
-    def _plain_conv1(self, x: Tensor, skip: Tensor) -> Tensor:
-        align = {"align_corners": False} if self.upsample == "bilinear" else {}
-        x = functional.interpolate(x, scale_factor=2.0, mode=self.upsample, **align)
-        result: Tensor = self.conv1(torch.cat([x, skip], dim=1))
-        return result
-
-    def _merged_conv1(self, x: Tensor, skip: Tensor) -> Tensor:
-        coarse, fine = split_kernel(self.conv1.weight, channels_in=self.channels_in)
-        x = functional.conv_transpose2d(x, coarse, self.conv1.bias, stride=2, padding=1)
-        return x + functional.conv2d(skip, fine, padding=1)
 
 
 def split_kernel(

@@ -65,9 +65,7 @@ def _merge_linear_steps(net: nn.Module) -> None:
 
 
 class MergedUpBlock(nn.Module):
-    """An up block, batch norm folded, that never upsamples the coarse map
-    (:func:`hudepth.models.decoder.split_kernel`).
-    """
+    """An up block, batch norm folded, that never upsamples the coarse map (see :func:`split_kernel`)."""
 
     def __init__(self, block: UpBlock) -> None:
         super().__init__()

@@ -57,17 +57,13 @@ class UNet(nn.Module):
         self.output = final
 
     def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:
-        """Return the encoder's feature maps, finest first, as the decoder takes them; ``run`` is as in
-        :meth:`Encoder.forward`.
-        """
+        """Return the encoder's feature maps, finest first, as the decoder takes them; ``run`` runs a module."""
         raise NotImplementedError
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Predict depth / max_depth_m, in [0, 1] with the sigmoid output, from images normalised with ImageNet's
-        statistics.
+        """Predict depth / max_depth_m, in [0, 1] with the sigmoid output, from ImageNet-normalised RGB.
 
-        Raises ConfigError if a side is not a multiple of the deepest stage's stride; the message gives the nearest
-        sizes that are.
+        Raises ConfigError if a side is not a multiple of the deepest stage's stride; see :func:`check_size`.
         """
         check_size(*image.shape[-2:], stride=self.encoder.stages[-1].stride)
         run = recomputed if self.recompute and self.training else run_stage
@@ -79,8 +75,7 @@ class UNet(nn.Module):
 
 
 def check_size(height: int, width: int, *, stride: int) -> None:
-    """Check that a network of this stride [pixels of the image per position of its deepest map] takes images of this
-    size.
+    """Check that a network whose deepest map has one position per ``stride`` pixels takes images of this size.
 
     Raises ConfigError if a side is not a positive multiple of ``stride``; the message gives the nearest sizes that are.
     """
