@@ -9,14 +9,7 @@ from hudepth.base.options import convert, parse
 
 
 def report(config: dict[str, Any]) -> None:
-    """Run the verb ``compare``, ``table``, ``sweep`` or ``figures``.
-
-    Args:
-        config: conf/report.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user.
-    """
+    """Run the verb of conf/report.yaml and its overrides; any error is a HudepthError of one line."""
     verb = convert("verb", config["verb"], Literal["compare", "table", "sweep", "figures"])
     protocols = [name for name, protocol in (config["protocol"] or {}).items() if protocol]
     if verb in ("compare", "sweep"):

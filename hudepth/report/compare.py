@@ -25,10 +25,8 @@ from hudepth.runs.results import Result, find_result
 from hudepth.runs.run import CHECKPOINTS
 from hudepth.viz.panels import save_figure, save_panels
 
-PER_IMAGE = ("abs_rel", "rmse")
-"""Metrics of compare.csv, which is sorted by the first."""
-SHOWN = 12
-"""Images in the right half of compare.png."""
+PER_IMAGE = ("abs_rel", "rmse")  # metrics of compare.csv, which is sorted by the first
+SHOWN = 12  # images in the right half of compare.png
 Place = Annotated[Path, "run directory | folder of test results"]
 
 
@@ -51,10 +49,7 @@ class CompareOptions:
 def compare(options: CompareOptions) -> None:
     """Compare two results on the same images; print the table, write compare.json, compare.csv and compare.png.
 
-    images.png joins them if checkpoints and data are at hand.
-
-    Raises:
-        HudepthError: if the results are missing, or not of the same images, data and protocol.
+    images.png needs checkpoints and data. Raises HudepthError if the results are missing or cannot be paired.
     """
     a, b = (find_result(path, options.protocol) for path in (options.a, options.b))
     tables = paired(a, b)
@@ -90,10 +85,10 @@ def _draw_images(path: Path, a: Result, b: Result, options: CompareOptions) -> N
 
 def tested_on_training_data(result: Result) -> bool:
     """Tell whether a network was tested on the data set it was trained on, which is the one its run can open."""
-    trained_on = result.document.get("checkpoint")
+    found = result.document.get("checkpoint")
     for key in ("trained_on", "fingerprint"):
-        trained_on = trained_on.get(key) if isinstance(trained_on, dict) else None
-    return bool(trained_on == result.data["fingerprint"])
+        found = found.get(key) if isinstance(found, dict) else None
+    return bool(found == result.data["fingerprint"])
 
 
 def verdict(name: str, difference: Difference) -> str:
@@ -106,11 +101,7 @@ def verdict(name: str, difference: Difference) -> str:
 
 
 def differing(a: Result, b: Result, count: int, *, metric: str = "abs_rel") -> list[str]:
-    """Return the ids of the ``count`` images whose metric differs most, most first.
-
-    Raises:
-        DataError: if the results are not of the same images, or one does not have the metric.
-    """
+    """Return the ids of the images whose metric differs most; DataError if there is none or they cannot be paired."""
     tables = paired(a, b)
     return [tables[0].ids[row] for row in _by_difference(*tables, metric=metric)[:count]]
 
@@ -135,9 +126,11 @@ def _document(a: Result, b: Result, differences: dict[str, Difference], uncertai
         finite = (value if math.isfinite(value) else None for value in values)
         numbers = dict(zip(("a", "b", "difference", "low", "high"), finite, strict=True))
         metrics[name] = {**numbers, "verdict": verdict(name, found)}
-    return {
-        "a": {"path": str(a.path), "split": a.split, "checkpoint": a.document.get("checkpoint")},
-        "b": {"path": str(b.path), "split": b.split, "checkpoint": b.document.get("checkpoint")},
+    sides = {
+        side: {"path": str(each.path), "split": each.split, "checkpoint": each.document.get("checkpoint")}
+        for side, each in (("a", a), ("b", b))
+    }
+    return sides | {
         "images": len(a.table.ids),
         "protocol": a.stamp,
         "data": a.data,

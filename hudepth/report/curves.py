@@ -13,18 +13,12 @@ from hudepth.base.errors import DataError
 def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> Figure:
     """Draw training and validation curves of the total loss and of its terms, one plot each.
 
-    Args:
-        history: rows with ``epoch``, ``train/loss/<term>`` and ``val/loss/<term>``.
-        title: of the figure.
-
-    Raises:
-        DataError: if the history holds no training loss.
+    Rows of the history hold ``epoch``, ``train/loss/<term>`` and ``val/loss/<term>``; DataError if there is no term.
     """
     names = [key.removeprefix("train/loss/") for key in history[0] if key.startswith("train/loss/")]
     if not names:
-        raise DataError(
-            "the history of epochs has no training loss (train/loss/total). Pass the metrics.csv of a training run."
-        )
+        missing = "the history of epochs has no training loss (train/loss/total)"
+        raise DataError(f"{missing}. Pass the metrics.csv of a training run.")
     names.sort(key=lambda name: name != "total")
     figure = Figure(figsize=(3.4 * len(names), 3.2), dpi=110, layout="constrained")
     if title:
@@ -37,8 +31,7 @@ def draw_curves(history: Sequence[Mapping[str, float]], *, title: str = "") -> F
             if points:
                 axis.plot(*zip(*points, strict=True), marker=".", label=label)
         axis.set_title(f"{name} loss", fontsize=10)
-        axis.set_xlabel("epoch")
-        axis.set_xlim(first - 0.5, last + 0.5)
+        axis.set(xlabel="epoch", xlim=(first - 0.5, last + 0.5))
         axis.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=1))
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)

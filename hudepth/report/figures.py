@@ -33,10 +33,7 @@ class FiguresOptions:
 def draw_figures(options: FiguresOptions) -> None:
     """Draw the curves of the loss and its terms, and panels of RGB, ground truth, prediction and error.
 
-    The panels need the run's checkpoint and its data. Where one is missing, only the curves are drawn.
-
-    Raises:
-        HudepthError: if there is no such run, or it has no history.
+    Without the run's checkpoint or data there are only curves. Raises HudepthError if there is no run or no history.
     """
     run = newest_run(options.paths["runs"]) if options.run == Path("last") else options.run
     if not is_run(run):
@@ -47,10 +44,9 @@ def draw_figures(options: FiguresOptions) -> None:
     log.info("total loss and its terms by epoch: %s", (output / "curves.png").resolve())
     if not options.panels:
         return
+    count = options.panels
     try:
-        panels = run_panels(
-            run, lambda data: evenly_spaced(sorted(data.split.test), options.panels), config=vars(options)
-        )
+        panels = run_panels(run, lambda data: evenly_spaced(sorted(data.split.test), count), config=vars(options))
     except HudepthError as error:
         log.warning("no panels: %s", error)
         return

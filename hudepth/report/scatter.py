@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from hudepth.metrics.summary import Floats
 from hudepth.viz.style import BLUE, ORANGE
 
 SIDES = {"a": BLUE, "b": ORANGE}
-LONGEST = 32
-"""Letters of an image id that fit next to a bar."""
+LONGEST = 32  # letters of an image id that fit next to a bar
 
 
 def draw_comparison(
-    ids: Sequence[str],
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    *,
-    shown: Sequence[str],
-    metric: str = "abs_rel",
-    title: str = "",
+    ids: Sequence[str], a: Floats, b: Floats, *, shown: Sequence[str], metric: str = "abs_rel", title: str = ""
 ) -> Figure:
-    """Draw each image's error under a against that under b, and some images as pairs of bars.
+    """Draw each image's error under a against that under b, and the images ``shown`` as pairs of bars, from the top.
 
-    Args:
-        ids: of the images.
-        a: [n] a metric of each image under a, smaller is better; NaN is left out on the left and written on the right.
-        b: [n] the same under b.
-        shown: ids for the right plot, from the top; they are ringed in the left one.
-        metric: its name.
-        title: of the figure.
+    ``a`` and ``b`` are [n] values of a metric, smaller is better; NaN is left out on the left and written on the right.
     """
     rows = [list(ids).index(image) for image in shown]
     figure = Figure(figsize=(11, 5.2), dpi=110, layout="constrained")
@@ -46,7 +32,7 @@ def draw_comparison(
     return figure
 
 
-def _scatter(axis: Axes, a: NDArray[np.float64], b: NDArray[np.float64], *, rows: Sequence[int], metric: str) -> None:
+def _scatter(axis: Axes, a: Floats, b: Floats, *, rows: Sequence[int], metric: str) -> None:
     finite = np.isfinite(a) & np.isfinite(b)
     highest = 1.05 * float(max(a[finite].max(initial=0), b[finite].max(initial=0))) or 1.0
     for name, won in (("a", finite & (a < b)), ("b", finite & (b < a))):
@@ -55,17 +41,19 @@ def _scatter(axis: Axes, a: NDArray[np.float64], b: NDArray[np.float64], *, rows
     even = finite & (a == b)
     if even.any():
         axis.scatter(a[even], b[even], s=12, color="0.5", linewidths=0, label=f"equal: {np.count_nonzero(even)} images")
-    ring: dict[str, Any] = {"s": 55, "facecolors": "none", "edgecolors": "0.2", "linewidths": 0.8}
-    axis.scatter(a[rows], b[rows], label="shown on the right", **ring)
+    axis.scatter(
+        a[rows], b[rows], s=55, facecolors="none", edgecolors="0.2", linewidths=0.8, label="shown on the right"
+    )
     axis.plot([0, highest], [0, highest], color="0.5", linewidth=0.8, zorder=0)
-    axis.set(xlim=(0, highest), ylim=(0, highest), aspect="equal")
+    axis.set(
+        xlim=(0, highest), ylim=(0, highest), aspect="equal", xlabel=f"{metric} under a", ylabel=f"{metric} under b"
+    )
     axis.grid(alpha=0.3)
-    axis.set(xlabel=f"{metric} under a", ylabel=f"{metric} under b")
     axis.set_title(f"{metric} of each image", fontsize=10)
     axis.legend(fontsize=8)
 
 
-def _bars(axis: Axes, names: Sequence[str], a: NDArray[np.float64], b: NDArray[np.float64], *, metric: str) -> None:
+def _bars(axis: Axes, names: Sequence[str], a: Floats, b: Floats, *, metric: str) -> None:
     places = np.arange(len(names))
     for label, values, offset in (("a", a, -0.2), ("b", b, 0.2)):
         lengths = np.nan_to_num(values, posinf=0)

@@ -18,8 +18,7 @@ from hudepth.runs.comparison import merge
 from hudepth.runs.results import Result, find_result
 from hudepth.runs.run import CHECKPOINTS
 
-WIDE, LOG_WIDTH = 190, 200
-"""Letters that all metrics need in a line; of a log."""
+WIDE, LOG_WIDTH = 190, 200  # letters that all metrics need in a line; of a log
 
 
 @dataclass(frozen=True)
@@ -35,10 +34,7 @@ class TableOptions:
 def write_table(options: TableOptions) -> None:
     """Print a row for each run and protocol, with 95 % intervals; write table.csv and table.md.
 
-    Where protocols, data or splits differ, columns state how.
-
-    Raises:
-        HudepthError: if a run has no result under a protocol.
+    Columns state where protocols, data or splits differ. Raises HudepthError if a run has no result under a protocol.
     """
     if not options.runs:
         raise ConfigError("runs is not set. Pass runs=[<run directory>,<run directory>].")

@@ -10,8 +10,7 @@ from pathlib import Path
 from hudepth.report.ablation.rows import Row
 
 UNKNOWN = "unknown"
-NAMED = 3
-"""Most runs that a line lists by name."""
+NAMED = 3  # most runs that a line lists by name
 
 
 def undefined(rows: Sequence[Row], metrics: Sequence[str]) -> list[str]:
@@ -53,13 +52,12 @@ def other_versions(versions: Mapping[str, Sequence[str]], reference: Row) -> lis
         return []
     own = next(iter(reference.runs.values())).run.path.name
     basis = next(version for version, runs in versions.items() if own in runs)
-    others = "; ".join(f"{version}: {_some(runs)}" for version, runs in versions.items() if version != basis)
-    return [f"not all runs are of hudepth {basis}, the reference's: {others}"]
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
+    others = []
+    for version, runs in versions.items():
+        if version != basis:
+            more = f" and {len(runs) - NAMED} more" if len(runs) > NAMED else ""
+            others.append(f"{version}: {', '.join(runs[:NAMED])}{more}")
+    return [f"not all runs are of hudepth {basis}, the reference's: {'; '.join(others)}"]
 
 
 def _version(run: Path) -> str:

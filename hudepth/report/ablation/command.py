@@ -17,12 +17,11 @@ from hudepth.report.ablation.document import document, table_csv
 from hudepth.report.ablation.page import page
 from hudepth.report.ablation.pictures import draw_pictures
 from hudepth.report.ablation.report import Report, make_report
-from hudepth.report.ablation.rows import Rows, sort_runs
+from hudepth.report.ablation.rows import sort_runs
 from hudepth.report.ablation.tables import print_table, table_md, table_tex
 from hudepth.runs.sweeps import Sweep, read_jobs, read_sweep
 
-FOLDER = "report"
-"""Within the sweep's folder, unless overridden."""
+FOLDER = "report"  # within the sweep's folder, unless overridden
 
 
 @dataclass(frozen=True)
@@ -45,15 +44,20 @@ class SweepOptions:
 def report_sweep(options: SweepOptions) -> None:
     """Print the table of a sweep; write table.csv, table.md, table.tex, document.json, pictures and report.html.
 
-    Raises:
-        HudepthError: if the folder holds no run with a result, or nothing can be written.
+    Raises HudepthError if the folder holds no run with a result, or nothing can be written.
     """
     output = options.output or options.dir / FOLDER
     sweep = read_sweep(options.dir, name=options.name)
     reports = tuple(f"skipped: '{path}' " for path in (options.dir / FOLDER, output))  # earlier ones
     sweep = replace(sweep, notes=[note for note in sweep.notes if not note.startswith(reports)])
     rows = sort_runs(sweep, options.protocol, track=lambda runs: track(runs, total=len(runs), what="reading runs"))
-    report = _compute(rows, sweep, options)
+    draws = {"repeats": options.repeats, "seed": options.seed}
+    try:
+        report = make_report(rows, protocol=options.protocol, reference=options.reference, **draws)
+    except HudepthError:  # without a table, this is what explains why there is none
+        for line in (*rows.troubles, *sweep.notes):
+            log.warning("%s", line)
+        raise
     for line in [*report.warnings, *sweep.notes]:
         log.warning("%s", line)
     print_table(report)
@@ -61,31 +65,17 @@ def report_sweep(options: SweepOptions) -> None:
     log.info("page, tables and pictures: %s", (output / "report.html").resolve())
 
 
-def _compute(rows: Rows, sweep: Sweep, options: SweepOptions) -> Report:
-    try:
-        return make_report(
-            rows, protocol=options.protocol, reference=options.reference, repeats=options.repeats, seed=options.seed
-        )
-    except HudepthError:  # without a table, this is what explains why there is none
-        for line in (*rows.troubles, *sweep.notes):
-            log.warning("%s", line)
-        raise
-
-
 def _write(report: Report, sweep: Sweep, output: Path, options: SweepOptions) -> None:
-    write_text(output / "table.csv", table_csv(report))
-    write_text(output / "table.md", table_md(report))
-    write_text(output / "table.tex", table_tex(report))
+    for name, text in (("table.csv", table_csv), ("table.md", table_md), ("table.tex", table_tex)):
+        write_text(output / name, text(report))
     write_json(output / "document.json", document(report, sweep))
     pictures = draw_pictures(report, output, config=vars(options))
-    title = f"Sweep {options.name or _name(sweep)}"
-    facts = {"Made": date.today().isoformat()}
-    write_text(output / "report.html", page(report, title=title, pictures=pictures, notes=sweep.notes, facts=facts))
-
-
-def _name(sweep: Sweep) -> str:
     try:
         names = list(read_jobs(sweep.folder))
     except HudepthError:
         names = []
-    return names[0] if len(names) == 1 else sweep.folder.resolve().name
+    name = options.name or (names[0] if len(names) == 1 else sweep.folder.resolve().name)
+    facts = {"Made": date.today().isoformat()}
+    write_text(
+        output / "report.html", page(report, title=f"Sweep {name}", pictures=pictures, notes=sweep.notes, facts=facts)
+    )

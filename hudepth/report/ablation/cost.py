@@ -27,18 +27,15 @@ class Cost:
 
     label: str
     parameters: int
-    mult_adds: int
-    """For one image at the run's size."""
+    mult_adds: int  # for one image at the run's size
     estimate: Estimate
 
 
 def find_costs(report: Report, *, metric: str, trust: Sequence[str] = ()) -> list[Cost]:
     """Return what the network of each row with a result costs, with its estimate of a metric; empty if all are equal.
 
-    Networks are built on the meta device, so that no weight is allocated or read.
-
-    Raises:
-        HudepthError: if a configuration cannot be built, as of a class from a module that ``trust`` does not list.
+    Networks are built on the meta device: no weight is allocated or read. Raises HudepthError if one cannot be built,
+    as of a class from a module that ``trust`` does not list.
     """
     known: dict[str, tuple[int, int]] = {}
     found = []
@@ -65,12 +62,12 @@ def draw_cost(costs: Sequence[Cost], *, metric: str = "abs_rel") -> Figure:
     """Draw the metric of each row against parameters and against multiply-adds; bars are intervals over seeds."""
     figure = Figure(figsize=(9.6, 3.9), dpi=130, layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
+    axes[0].set_ylabel(f"{metric}, mean over seeds", fontsize=9)
     low, high = usual_range(each.estimate.mean for each in costs)
     margin = 0.3 * (high - low) or 0.01
     axes[0].set_ylim(low - margin, high + margin)
     _points(axes[0], costs, [each.parameters / 1e6 for each in costs], "parameters [millions]")
     _points(axes[1], costs, [each.mult_adds / 1e9 for each in costs], "multiply-adds per image [billions]")
-    axes[0].set_ylabel(f"{metric}, mean over seeds", fontsize=9)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8, frameon=False)
     return figure
 

@@ -18,8 +18,7 @@ PARTS = (
     "_difference_scenes_high", "_paired_seeds", "_verdict",
 )  # fmt: skip
 """What follows a metric's name in the columns of table.csv."""
-OWN = ("row", "reference", "seeds", "seeds_tried", "differs")
-"""Columns whose names no factor may take."""
+OWN = ("row", "reference", "seeds", "seeds_tried", "differs")  # columns whose names no factor may take
 
 
 def table_csv(report: Report) -> str:
@@ -97,6 +96,4 @@ def _plain(value: Any) -> Any:
         return [_plain(value.low), _plain(value.high)] if value.known else None
     if isinstance(value, dict):
         return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -19,8 +19,7 @@ from hudepth.viz.limits import usual_range
 from hudepth.viz.style import BLUE, ORANGE, shorten, strip_frame
 
 COLOURS = {BETTER: BLUE, WORSE: ORANGE, NOT_SHOWN: "0.45"}
-OFFSET = 0.17
-"""From the middle of a row to its two intervals."""
+OFFSET = 0.17  # from the middle of a row to its two intervals
 
 
 def draw_effects(report: Report) -> Figure:

@@ -45,10 +45,8 @@ class Interval:
 class Estimate:
     """A metric of a row."""
 
-    values: dict[str, float]
-    """By seed."""
-    mean: float
-    """Over seeds; NaN if the metric is undefined for one of them."""
+    values: dict[str, float]  # by seed
+    mean: float  # over seeds; NaN if the metric is undefined for one of them
     seeds: Interval
     scenes: Interval
 
@@ -57,14 +55,11 @@ class Estimate:
 class Contrast:
     """A metric of a row minus that of the reference."""
 
-    value: float
-    """Mean over :attr:`paired`."""
+    value: float  # mean over the paired seeds
     seeds: Interval
     scenes: Interval
-    paired: list[str]
-    """The seeds that both rows have."""
-    verdict: str
-    """``better``, ``worse`` or ``not shown``."""
+    paired: list[str]  # the seeds that both rows have
+    verdict: str  # better, worse or not shown
 
 
 def over_seeds(values: Sequence[float]) -> Interval:
@@ -80,8 +75,7 @@ def over_seeds(values: Sequence[float]) -> Interval:
 def estimate(name: str, values: Mapping[str, float], draws: Mapping[str, Draws]) -> Estimate:
     """Return a metric of a row from its values by seed, at least one.
 
-    ``draws`` holds resampled metrics by seed, of the same images and with the same draws; it is empty if the seeds were
-    tested on different images.
+    ``draws``, by seed, are of the same images and with the same draws; empty if seeds were tested on different images.
     """
     numbers = list(values.values())
     return Estimate(dict(values), _mean(numbers), over_seeds(numbers), _over_scenes(name, draws.values()))

@@ -12,24 +12,18 @@ from hudepth.runs.identity import SEEDS, canonical, identity
 from hudepth.viz.style import shorten
 
 TARGET = "_target_"
-ABSENT = "-"
-"""Of a row whose configuration has no such key."""
-LONGEST = 40
-"""Letters of a formatted value."""
+ABSENT = "-"  # of a row whose configuration has no such key
+LONGEST = 40  # letters of a formatted value
 
 
 @dataclass(frozen=True)
 class Factor:
     """One thing that varies."""
 
-    key: str
-    """Dotted, as in config.yaml; that of a class ends in ``_target_``."""
-    name: str
-    """Short, for the head of a column."""
-    values: list[Any]
-    """A value for each row; None both for null and for rows without the key."""
-    shown: list[str]
-    """The same, formatted."""
+    key: str  # dotted, as in config.yaml; that of a class ends in _target_
+    name: str  # short, for the head of a column
+    values: list[Any]  # a value for each row; None both for null and for rows without the key
+    shown: list[str]  # the same, formatted
 
 
 def variant(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -50,13 +44,9 @@ def seed_of(config: Mapping[str, Any]) -> str:
 
 
 def find_factors(variants: Sequence[Mapping[str, Any]]) -> list[Factor]:
-    """Return what differs between rows.
+    """Return what differs between rows, each given by its :func:`variant`.
 
-    Options of a class that differs, as of one loss among several, are factors only if they differ between rows of the
-    same class.
-
-    Args:
-        variants: :func:`variant` of each row.
+    Options of a class that differs, as of one loss among several, count only if they differ within one class.
     """
     rows = [_spell_out(row, variants) for row in variants]
     found = [key for key in dict.fromkeys(key for row in rows for key in row) if _varies(key, rows)]

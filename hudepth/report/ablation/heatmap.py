@@ -26,44 +26,36 @@ EMPTY = "0.9"
 
 @dataclass(frozen=True)
 class Grid:
-    """Rows that differ in nothing but the weights."""
+    """Rows that differ in nothing but the weights: names, and formatted values from the lowest up."""
 
     y: str
     x: str
-    panel: str
-    """Names of the weights: down, across, and from panel to panel; the last is empty if it does not vary."""
+    panel: str  # empty if the third weight does not vary
     ys: list[str]
     xs: list[str]
     panels: list[str]
-    """Their formatted values, lowest first."""
-    cells: dict[tuple[str, str, str], Row]
-    """By value of panel, y and x."""
+    cells: dict[tuple[str, str, str], Row]  # by value of panel, y and x
 
 
 def find_grid(rows: Sequence[Row]) -> Grid | None:
-    """Return the largest grid of weights among rows; None if no two weights have two values each.
-
-    Rows that differ in something else, or lack a weight, are in no grid with the others.
-    """
+    """Return the largest grid of rows that differ in weights alone; None if no two weights have two values each."""
     groups: dict[tuple[tuple[str, str], ...], list[Row]] = {}
     for row in rows:
-        config = row.config
-        if row.runs and all(key in config for key in WEIGHTS):
-            rest = tuple((key, canonical(value)) for key, value in sorted(config.items()) if key not in WEIGHTS)
+        if row.runs and all(key in row.config for key in WEIGHTS):
+            rest = tuple((key, canonical(value)) for key, value in sorted(row.config.items()) if key not in WEIGHTS)
             groups.setdefault(rest, []).append(row)
     group = max(groups.values(), key=len, default=[])
     values = {key: _sort_values([row.config[key] for row in group]) for key in WEIGHTS}
     varied = [key for key in WEIGHTS if len(values[key]) > 1]
     if len(varied) < 2:
         return None
-    y, x, *more = varied
-    panel = more[0] if more else ""
+    y, x, panel = (*varied, "")[:3]
     cells = {}
     for row in group:
         where, down, across = (format_value(row.config[key]) if key else "" for key in (panel, y, x))
         cells[where, down, across] = row
-    names = [key.rpartition(".")[2] for key in (y, x, panel)]
-    return Grid(names[0], names[1], names[2], values[y], values[x], values[panel] if panel else [""], cells)
+    down, across, where = (key.rpartition(".")[2] for key in (y, x, panel))
+    return Grid(down, across, where, values[y], values[x], values.get(panel, [""]), cells)
 
 
 def _sort_values(found: Sequence[Any]) -> list[str]:
@@ -110,11 +102,8 @@ def draw_heatmap(grid: Grid, *, metric: str = "abs_rel") -> Figure:
 
 def _write(axis: Axes, x: int, y: int, value: float, *, colour: str, is_best: bool) -> None:
     """Write a cell's number on it; a cell without a run stays empty."""
-    if not math.isfinite(value):
-        axis.text(x, y, "–", ha="center", va="center", fontsize=9, color="0.5")
-        return
+    text, colour = (f"{value:.4f}", colour) if math.isfinite(value) else ("–", "0.5")
     weight = "bold" if is_best else "normal"
-    axis.text(x, y, f"{value:.4f}", ha="center", va="center", fontsize=9, color=colour, fontweight=weight)
+    axis.text(x, y, text, ha="center", va="center", fontsize=9, color=colour, fontweight=weight)
     if is_best:
-        ring: dict[str, Any] = {"fill": False, "edgecolor": ORANGE, "linewidth": 2.2}
-        axis.add_patch(Rectangle((x - 0.47, y - 0.46), 0.94, 0.92, **ring))
+        axis.add_patch(Rectangle((x - 0.47, y - 0.46), 0.94, 0.92, fill=False, edgecolor=ORANGE, linewidth=2.2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,8 @@ from hudepth.report.ablation.variants import draw_variants
 from hudepth.report.compare import tested_on_training_data
 from hudepth.viz.panels import save_figure
 
-IMAGES, NETWORKS = 4, 12
-"""Most columns and most networks in panels.png."""
-NAMED, COLOURED = 16, 8
-"""Lines with a colour in curves.png: up to 16 rows all of them, else 8."""
+IMAGES, NETWORKS = 4, 12  # most columns and networks in panels.png
+NAMED, COLOURED = 16, 8  # lines with a colour in curves.png: up to 16 rows all of them, else 8
 BY = "abs_rel"
 
 
@@ -36,8 +34,7 @@ class Picture:
     caption: str
 
 
-Drawn = tuple[Figure, str, str] | None
-"""Figure, title and caption; None if there is nothing to show."""
+Drawn = tuple[Figure, str, str] | None  # figure, title and caption; None if there is nothing to show
 
 
 def draw_pictures(report: Report, folder: Path, *, config: Mapping[str, Any]) -> list[Picture]:
@@ -48,24 +45,22 @@ def draw_pictures(report: Report, folder: Path, *, config: Mapping[str, Any]) ->
     pictures = []
     for name, draw in DRAWN.items():
         path = folder / f"{name}.png"
-        found = draw(report, config)
-        if found is None:
-            path.unlink(missing_ok=True)
-        else:
+        if found := draw(report, config):
             save_figure(path, found[0])
             pictures.append(Picture(path.read_bytes(), *found[1:]))
+        else:
+            path.unlink(missing_ok=True)
     return pictures
 
 
 def _effects(report: Report, _config: Mapping[str, Any]) -> Drawn:
     if not any(row.contrasts for row in report.rows):
         return None
-    return (
-        draw_effects(report),
-        f"Differences from {report.reference.label}",
+    caption = (
         "Dots: mean over the seeds that both rows have. Thick: 95 % interval over scenes; thin: over seeds. In colour: "
-        "both exclude 0. Arrows point to what lies outside the plot.",
+        "both exclude 0. Arrows point to what lies outside the plot."
     )
+    return draw_effects(report), f"Differences from {report.reference.label}", caption
 
 
 def _curves(report: Report, _config: Mapping[str, Any]) -> Drawn:
@@ -116,13 +111,9 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
     if not count:
         return None
     order = sort_by_accuracy(report)
-    kept = {row.label for row in order[:NETWORKS]}
-    runs = {row.label: next(iter(row.runs.values())) for row in report.rows if row.label in kept}
-    usable = {
-        label: each.run.path
-        for label, each in runs.items()
-        if each.run.checkpoint and tested_on_training_data(each.result)
-    }
+    best = order[:NETWORKS]
+    runs = {row.label: next(iter(row.runs.values())) for row in report.rows if row in best}
+    usable = [x for x in runs.items() if x[1].run.checkpoint and tested_on_training_data(x[1].result)]
     if not usable:
         log.info("no panels.png: no run has its checkpoint and was tested on the data it was trained on")
         return None
@@ -132,9 +123,9 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
     ids = sorted(report.first.table.ids)
     images = [ids[place] for place in evenly_spaced(range(len(ids)), count)]
     found = {}
-    for label, run in usable.items():
+    for label, each in usable:
         try:
-            found[label] = panels_beside({label: run}, images, config=config)
+            found[label] = panels_beside({label: each.run.path}, images, config=config)
         except HudepthError as error:
             log.warning("not in panels.png: '%s': %s", label, error)
     if not found:
@@ -146,19 +137,13 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
 
 def sort_by_accuracy(report: Report) -> list[Row]:
     """Return the rows with a result: the reference, then the best first."""
-    means = {row.label: row.estimates[BY].mean if BY in row.estimates else math.nan for row in report.rows}
 
     def place(row: Row) -> tuple[bool, float]:
-        return row is not report.reference, means[row.label] if math.isfinite(means[row.label]) else math.inf
+        mean = row.estimates[BY].mean if BY in row.estimates else math.nan
+        return row is not report.reference, mean if math.isfinite(mean) else math.inf
 
     return sorted((row for row in report.rows if row.runs), key=place)
 
 
-DRAWN: dict[str, Callable[[Report, Mapping[str, Any]], Drawn]] = {
-    "effects": _effects,
-    "curves": _curves,
-    "heatmap": _heatmap,
-    "cost": _cost,
-    "panels": _panels,
-}
+DRAWN = {"effects": _effects, "curves": _curves, "heatmap": _heatmap, "cost": _cost, "panels": _panels}
 """By name of the file, in the order of the page."""

@@ -32,25 +32,17 @@ class Report:
     reference: Row
     troubles: list[Trouble]
     warnings: list[str]
-    first: Result
-    """The reference's result of its lowest seed: what the others are compared with."""
-    uncertainty: dict[str, Any]
-    """See :func:`hudepth.metrics.bootstrap.describe`."""
-    versions: dict[str, list[str]]
-    """Names of the runs that count, by the version of hudepth that trained them."""
+    first: Result  # the reference's result of its lowest seed: what the others are compared with
+    uncertainty: dict[str, Any]  # see :func:`hudepth.metrics.bootstrap.describe`
+    versions: dict[str, list[str]]  # names of the runs that count, by the version of hudepth that trained them
 
 
 def make_report(
     rows: Rows, *, protocol: str, reference: str | None = None, repeats: int = REPEATS, seed: int = SEED
 ) -> Report:
-    """Compute a sweep's table.
+    """Compute a sweep's table; ``repeats`` and ``seed`` are those of the bootstrap.
 
-    ``reference`` is the label or the ``variant`` of a row, by default the first that has a result; ``repeats`` and
-    ``seed`` are those of the bootstrap.
-
-    Raises:
-        ConfigError: if there is no such row.
-        DataError: if no run has a result.
+    ``reference``, ConfigError and DataError: see :func:`hudepth.report.ablation.rows.choose_reference`.
     """
     table = rows.rows
     warnings: list[str] = []

@@ -16,21 +16,18 @@ from hudepth.runs.run import Run
 from hudepth.runs.status import FINISHED
 from hudepth.runs.sweeps import Sweep
 
-VARIANT = "variant"
-"""The label that names a row."""
+VARIANT = "variant"  # the label that names a row
 NO_RESULT, REPEATED, NOT_COMPOSED = "no result", "repeated", "not composed"
 
 
 @dataclass(frozen=True)
 class Trouble:
-    """A run, or a job that never became one, that is in no mean."""
+    """A run, or a job that never became one (``run`` is empty), that is in no mean."""
 
     run: str
-    """Name of its folder; empty if it never had one."""
     row: str
     seed: str
-    state: str
-    """``failed``, ``pruned``, ``interrupted``, ``running``, ``not composed``, ``no result`` or ``repeated``."""
+    state: str  # failed, pruned, interrupted, running, not composed, no result or repeated
     why: str
 
     def __str__(self) -> str:
@@ -50,25 +47,17 @@ class Repetition:
 class Row:
     """A row of the table: the runs of one configuration, and their metrics."""
 
-    config: dict[str, Any]
-    """By dotted key, without seeds; see :func:`hudepth.report.ablation.factors.variant`."""
-    named: str
-    """The label ``variant``; empty if there is none."""
-    seeds: list[str]
-    """All that were tried, lowest first."""
+    config: dict[str, Any]  # by dotted key, without seeds; see :func:`hudepth.report.ablation.factors.variant`
+    named: str  # the label variant; empty if there is none
+    seeds: list[str]  # all that were tried, lowest first
     label: str = ""
-    factors: list[str] = field(default_factory=list)
-    """A formatted value for each factor of the table."""
-    runs: dict[str, Repetition] = field(default_factory=dict)
-    """Those that count, by seed, lowest first."""
+    factors: list[str] = field(default_factory=list)  # a formatted value for each factor of the table
+    runs: dict[str, Repetition] = field(default_factory=dict)  # those that count, by seed, lowest first
     is_reference: bool = False
-    differs: list[str] = field(default_factory=list)
-    """How its protocol, data or split differ from those of the reference."""
+    differs: list[str] = field(default_factory=list)  # how its protocol, data or split differ from the reference's
     estimates: dict[str, Estimate] = field(default_factory=dict)
-    contrasts: dict[str, Contrast] = field(default_factory=dict)
-    """Empty for the reference and for rows that cannot be paired with it."""
-    best: set[str] = field(default_factory=set)
-    """Metrics in which no comparable row is better."""
+    contrasts: dict[str, Contrast] = field(default_factory=dict)  # empty if not paired with the reference
+    best: set[str] = field(default_factory=set)  # metrics in which no comparable row is better
 
     @property
     def counted(self) -> str:
@@ -102,9 +91,7 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[Run]], Itera
 def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -> Row:
     """Return the row that the others are compared with: ``name`` is a label or a ``variant``, None the first result.
 
-    Raises:
-        ConfigError: if there is no such row.
-        DataError: if no row has a result.
+    Raises ConfigError if there is no such row, DataError if no row has a result.
     """
     usable = [row for row in table if row.runs]
     result = f"a test result of protocol '{protocol}'"
@@ -186,5 +173,5 @@ def _never_composed(labels: dict[str, str], error: str, rows: Sequence[Row]) -> 
     if row is not None and seed != ABSENT:
         row.seeds = sort_seeds([*row.seeds, seed])
     words = [f"{key}={value}" for key, value in labels.items() if key not in (VARIANT, "seed")]
-    label = row.label if row is not None else ", ".join([named, *words] if named else words)
+    label = row.label if row is not None else ", ".join([*filter(None, [named]), *words])
     return Trouble("", label, seed, NOT_COMPOSED, " ".join(error.split()))

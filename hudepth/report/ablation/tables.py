@@ -14,10 +14,8 @@ from hudepth.report.ablation.estimates import BETTER, NOT_SHOWN
 from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.rows import Row
 
-LOG_WIDTH = 200
-"""Letters in a line of a log, where all metrics fit."""
-LONGEST = 28
-"""Letters of a label before it is wrapped on a terminal."""
+LOG_WIDTH = 200  # letters in a line of a log, where all metrics fit
+LONGEST = 28  # letters of a label before it is wrapped on a terminal
 Form = Literal["terminal", "markdown", "latex"]
 
 

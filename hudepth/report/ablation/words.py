@@ -23,16 +23,12 @@ def places(report: Report) -> dict[str, int]:
 
 def number(value: float, digits: int, *, sign: bool = False) -> str:
     """Return a number with so many decimals; ``-`` if it is not finite."""
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
+    return f"{value:{'+' if sign else ''}.{digits}f}" if math.isfinite(value) else "-"
 
 
 def between(interval: Interval, digits: int, *, sign: bool = False) -> str:
     """Return ``0.21 to 0.24``; empty if there is no interval."""
-    if not interval.known:
-        return ""
-    return f"{number(interval.low, digits, sign=sign)} to {number(interval.high, digits, sign=sign)}"
+    return " to ".join(number(x, digits, sign=sign) for x in (interval.low, interval.high) if interval.known)
 
 
 def half_width(interval: Interval, digits: int) -> str:
@@ -42,8 +38,7 @@ def half_width(interval: Interval, digits: int) -> str:
 
 def heading(name: str) -> str:
     """Return a metric's name, its unit, and which way is better."""
-    info = metric_info(name)
-    return f"{info.label} {info.arrow}"
+    return f"{metric_info(name).label} {metric_info(name).arrow}"
 
 
 def rests_on(contrast: Contrast) -> str:
