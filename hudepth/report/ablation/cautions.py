@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from hudepth.report.ablation.rows import Row
 
-UNKNOWN = "unknown"
 NAMED = 3  # most runs that a line lists by name
 
 
@@ -40,9 +38,12 @@ def unpaired(rows: Sequence[Row], reference: Row) -> list[str]:
 def versions_of(table: Sequence[Row]) -> dict[str, list[str]]:
     """Return the names of the runs that count, by the version of hudepth that trained them."""
     versions: dict[str, list[str]] = {}
-    for row in table:
-        for each in row.runs.values():
-            versions.setdefault(_version(each.run.path), []).append(each.run.path.name)
+    for run in (each.run.path for row in table for each in row.runs.values()):
+        try:
+            found = json.loads((run / "environment.json").read_text(encoding="utf-8"))["packages"]["hudepth"]
+        except (OSError, ValueError, RecursionError, KeyError, TypeError):
+            found = None
+        versions.setdefault(found if isinstance(found, str) else "unknown", []).append(run.name)
     return versions
 
 
@@ -58,11 +59,3 @@ def other_versions(versions: Mapping[str, Sequence[str]], reference: Row) -> lis
             more = f" and {len(runs) - NAMED} more" if len(runs) > NAMED else ""
             others.append(f"{version}: {', '.join(runs[:NAMED])}{more}")
     return [f"not all runs are of hudepth {basis}, the reference's: {'; '.join(others)}"]
-
-
-def _version(run: Path) -> str:
-    try:
-        found = json.loads((run / "environment.json").read_text(encoding="utf-8"))["packages"]["hudepth"]
-    except (OSError, ValueError, RecursionError, KeyError, TypeError):
-        return UNKNOWN
-    return found if isinstance(found, str) else UNKNOWN

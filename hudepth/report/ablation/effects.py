@@ -35,8 +35,8 @@ def draw_effects(report: Report) -> Figure:
         axis.set_title(metric_info(name).label, fontsize=10)
         axis.set_xlabel("better →" if metric_info(name).higher_is_better else "← better", fontsize=9)
         axis.tick_params(axis="x", labelsize=8)
-        axis.locator_params(axis="x", nbins=5)
         axis.tick_params(axis="y", length=0)
+        axis.locator_params(axis="x", nbins=5)
         axis.grid(axis="x", alpha=0.25)
         axis.set_axisbelow(True)
         strip_frame(axis, "top", "right", "left")
@@ -55,9 +55,8 @@ def _panel(axis: Axes, found: Mapping[int, Contrast]) -> None:
     axis.set_xlim(low, high)
     places, colours = np.array(list(found)), np.array([COLOURS[each.verdict] for each in found.values()])
     _intervals(axis, places - OFFSET / 2, [each.scenes for each in found.values()], colours, linewidth=5, alpha=0.35)
-    seen, left, right = _intervals(
-        axis, places + OFFSET, [each.seeds for each in found.values()], colours, linewidth=1.2
-    )
+    thin = [each.seeds for each in found.values()]
+    seen, left, right = _intervals(axis, places + OFFSET, thin, colours, linewidth=1.2)
     for ends, outside, arrow in ((left, left < low, "<"), (right, right > high, ">")):
         for mark, chosen in (("|", seen & ~outside), (arrow, seen & outside)):
             style: dict[str, Any] = {"s": 26, "c": colours[chosen], "linewidths": 1.2, "clip_on": False}

@@ -48,18 +48,18 @@ def find_factors(variants: Sequence[Mapping[str, Any]]) -> list[Factor]:
 
     Options of a class that differs, as of one loss among several, count only if they differ within one class.
     """
-    rows = [_spell_out(row, variants) for row in variants]
-    found = [key for key in dict.fromkeys(key for row in rows for key in row) if _varies(key, rows)]
-    names = _names(found)
-    return [
-        Factor(
-            key,
-            names[key],
-            [row.get(key) for row in rows],
-            [format_value(row[key], is_class=_is_target(key)) if key in row else ABSENT for row in rows],
-        )
-        for key in found
-    ]
+    # early_stopping: null becomes early_stopping._target_: null if other rows have a class there
+    classes = {key.removesuffix(f".{TARGET}") for row in variants for key in row if _is_target(key)}
+    rows = [{f"{key}.{TARGET}" if key in classes else key: value for key, value in row.items()} for row in variants]
+    groups = {key: key.removesuffix(f".{TARGET}") for row in rows for key in row}
+    groups = {key: group for key, group in groups.items() if _varies(key, rows)}
+    times = Counter(group.rpartition(".")[2] for group in groups.values())
+    factors = []
+    for key, group in groups.items():
+        short = group.rpartition(".")[2]
+        shown = [format_value(row[key], is_class=_is_target(key)) if key in row else ABSENT for row in rows]
+        factors.append(Factor(key, short if times[short] == 1 else group, [row.get(key) for row in rows], shown))
+    return factors
 
 
 def config_differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -73,9 +73,7 @@ def config_differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple
 
 def format_value(value: Any, *, is_class: bool = False) -> str:
     """Return a value short enough for a table: classes without their module, files without their folder."""
-    if value is None:
-        return "none"
-    text = _full(value)
+    text = "none" if value is None else _full(value)
     if isinstance(value, str):
         text = text.rpartition("." if is_class else "/")[2] or text
     return shorten(text, LONGEST)
@@ -93,29 +91,12 @@ def _is_target(key: str) -> bool:
     return key == TARGET or key.endswith(f".{TARGET}")
 
 
-def _spell_out(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Turn ``early_stopping: null`` into ``early_stopping._target_: null`` if other rows have a class there."""
-    classes = {key.removesuffix(f".{TARGET}") for each in rows for key in each if _is_target(key)}
-    return {f"{key}.{TARGET}" if key in classes else key: value for key, value in row.items()}
-
-
 def _varies(key: str, rows: Sequence[Mapping[str, Any]]) -> bool:
-    owners = _owners(key)
+    """Tell whether ``key`` differs between rows of the same classes, as far as it may be an option of them."""
+    parts = key.split(".")[: -2 if _is_target(key) else -1]
+    owners = [".".join([*parts[:length], TARGET]) for length in range(1, len(parts) + 1)]
     values: dict[tuple[str, ...], set[str]] = {}
     for row in rows:
         classes = tuple(canonical(row.get(owner)) for owner in owners)
         values.setdefault(classes, set()).add(canonical(row[key]) if key in row else ABSENT)
     return any(len(each) > 1 for each in values.values())
-
-
-def _owners(key: str) -> list[str]:
-    """Return the keys of the classes that ``key`` may be an option of, nearest last."""
-    parts = key.split(".")[: -2 if _is_target(key) else -1]
-    return [".".join([*parts[:length], TARGET]) for length in range(1, len(parts) + 1)]
-
-
-def _names(keys: Sequence[str]) -> dict[str, str]:
-    groups = {key: key.removesuffix(f".{TARGET}") for key in keys}
-    short = {key: group.rpartition(".")[2] for key, group in groups.items()}
-    times = Counter(short.values())
-    return {key: short[key] if times[short[key]] == 1 else groups[key] for key in keys}

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -60,8 +59,7 @@ def find_grid(rows: Sequence[Row]) -> Grid | None:
 
 def _sort_values(found: Sequence[Any]) -> list[str]:
     def order(value: Any) -> tuple[bool, float, str]:
-        is_number = isinstance(value, int | float)
-        return not is_number, value if is_number else 0, str(value)
+        return (False, value, str(value)) if isinstance(value, int | float) else (True, 0, str(value))
 
     distinct = {canonical(value): value for value in found}
     return list(dict.fromkeys(format_value(value) for value in sorted(distinct.values(), key=order)))
@@ -77,15 +75,21 @@ def draw_heatmap(grid: Grid, *, metric: str = "abs_rel") -> Figure:
     low, high = usual_range(known)
     best = (max if info.higher_is_better else min)(known, default=math.nan)
     scale: dict[str, Any] = {"vmin": low, "vmax": high if high > low else low + 1e-3}
-    name = SCORE_COLOURS if info.higher_is_better else f"{SCORE_COLOURS}_r"
-    scale["cmap"] = colour_map(name).with_extremes(bad=EMPTY)
+    colours = colour_map(SCORE_COLOURS if info.higher_is_better else f"{SCORE_COLOURS}_r")
+    scale["cmap"] = colours.with_extremes(bad=EMPTY)
     for axis, panel in zip(axes, grid.panels, strict=True):
         values = np.array([[means.get((panel, y, x), math.nan) for x in grid.xs] for y in grid.ys])
         drawn = axis.imshow(values, aspect="auto", **scale)
         for y, x in np.ndindex(*values.shape):
             value = float(values[y, x])
             is_light = (value > (scale["vmin"] + scale["vmax"]) / 2) == info.higher_is_better
-            _write(axis, x, y, value, colour="black" if is_light else "white", is_best=value == best)
+            # a cell without a run has a dash
+            text, colour = (f"{value:.4f}", "black" if is_light else "white") if math.isfinite(value) else ("–", "0.5")
+            weight = "bold" if value == best else "normal"
+            axis.text(x, y, text, ha="center", va="center", fontsize=9, color=colour, fontweight=weight)
+            if value == best:
+                ring = Rectangle((x - 0.47, y - 0.46), 0.94, 0.92, fill=False, edgecolor=ORANGE, linewidth=2.2)
+                axis.add_patch(ring)
         axis.set_xticks(range(wide), grid.xs, fontsize=9)
         axis.set_yticks(range(tall), grid.ys, fontsize=9)
         axis.tick_params(length=0)
@@ -98,12 +102,3 @@ def draw_heatmap(grid: Grid, *, metric: str = "abs_rel") -> Figure:
     bar.set_label(f"{info.label}, {'higher' if info.higher_is_better else 'lower'} is better", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return figure
-
-
-def _write(axis: Axes, x: int, y: int, value: float, *, colour: str, is_best: bool) -> None:
-    """Write a cell's number on it; a cell without a run stays empty."""
-    text, colour = (f"{value:.4f}", colour) if math.isfinite(value) else ("–", "0.5")
-    weight = "bold" if is_best else "normal"
-    axis.text(x, y, text, ha="center", va="center", fontsize=9, color=colour, fontweight=weight)
-    if is_best:
-        axis.add_patch(Rectangle((x - 0.47, y - 0.46), 0.94, 0.92, fill=False, edgecolor=ORANGE, linewidth=2.2))

@@ -33,9 +33,12 @@ def tag(name: str, *inside: str, **attributes: str | None) -> Html:
 
     Underscores in the names of attributes become hyphens, those at the end go: ``class_``, ``data_value``.
     """
-    found = ((key.rstrip("_").replace("_", "-"), value) for key, value in attributes.items() if value is not None)
-    words = "".join(f' {key}="{escape(value)}"' for key, value in found)
+    found = {key.rstrip("_").replace("_", "-"): value for key, value in attributes.items() if value is not None}
+    words = "".join(f' {key}="{escape(value)}"' for key, value in found.items())
     return Html(f"<{name}{words}>{_join(inside)}</{name}>")
+
+
+Cell = Callable[[Row, str, int], Html]  # of a row, a metric and its decimals
 
 
 def page(
@@ -50,20 +53,23 @@ def page(
 
     Pictures become part of the page; ``notes`` list what was skipped, ``facts`` join those at the top of the page.
     """
+    troubles = [(each.run or "-", each.row, each.seed, each.state, each.why or "-") for each in report.troubles]
+    columns = ("run", "row", "seed", "state", "why")
     parts = [
         ("differences", f"Differences from {report.reference.label}", _differences(report)),
         ("pictures", "Pictures", _join(map(_figure, pictures))),
-        ("not-counted", "Not counted", _troubles(report)),
+        ("not-counted", "Not counted", _listing("Runs that are in no mean", columns, troubles, long=(4,))),
         ("notes", "Notes", _list(notes, class_="plain") if notes else Html()),
         ("configurations", "Configurations", _configurations(report)),
     ]
     parts = [part for part in parts if part[2]]
     notice = tag("div", _list(report.warnings), class_="notice", role="note")
+    about = words.about(report)
     template = files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     return _Page(template).substitute(
         policy=_policy(template),
         title=escape(title),
-        about=escape(_sentence(words.about(report))),
+        about=escape(about[0].upper() + about[1:]),
         facts=_facts(report, facts or {}),
         warnings=notice if report.warnings else "",
         results=_results(report),
@@ -86,12 +92,8 @@ def _join(parts: Iterable[str]) -> Html:
     return Html("".join(part if isinstance(part, Html) else escape(part) for part in parts))
 
 
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
 def _list(lines: Iterable[str], *, class_: str | None = None) -> Html:
-    return tag("ul", *(tag("li", _sentence(line)) for line in lines), class_=class_)
+    return tag("ul", *(tag("li", line[:1].upper() + line[1:]) for line in lines), class_=class_)
 
 
 def _facts(report: Report, more: Mapping[str, str]) -> Html:
@@ -109,14 +111,17 @@ def _facts(report: Report, more: Mapping[str, str]) -> Html:
 
 def _results(report: Report) -> Html:
     factors = report.factors if any(row.named for row in report.rows) else []  # else they are the row's name
-    numbers = [_are_numbers(factor.shown) for factor in factors]
-    heads = [_sorter(factor.name, is_number=each) for factor, each in zip(factors, numbers, strict=True)]
-
-    def lead(row: Row) -> list[Html]:
-        cells = [_factor(value, is_number=each) for value, each in zip(row.factors, numbers, strict=False)]
-        return [*cells, tag("td", row.counted, data_value=str(len(row.runs)))]
-
-    return _metrics("Results", report, report.rows, _result, [*heads, _sorter("seeds")], lead)
+    leads: dict[str, list[Html]] = {row.label: [] for row in report.rows}
+    heads = []
+    for factor in factors:
+        is_number = all(x == ABSENT or re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", x) for x in factor.shown)
+        heads.append(_sorter(factor.name, is_number=is_number))
+        for cells, value in zip(leads.values(), factor.shown, strict=True):
+            sorted_by = "" if is_number and value == ABSENT else value
+            cells.append(tag("td", value, data_value=sorted_by, class_=None if is_number else "text"))
+    for row in report.rows:
+        leads[row.label].append(tag("td", row.counted, data_value=str(len(row.runs))))
+    return _metrics("Results", report, leads, _result, *heads, _sorter("seeds"))
 
 
 def _differences(report: Report) -> Html:
@@ -124,28 +129,25 @@ def _differences(report: Report) -> Html:
         "Row minus reference, paired by seed and by image; below it the 95 % intervals over seeds and over scenes. "
         "Better or worse: both exclude 0. Among many rows some differ by chance."
     )
-    rows = [row for row in report.rows if row.contrasts]
+    rows: dict[str, list[Html]] = {row.label: [] for row in report.rows if row.contrasts}
     table = _metrics("Differences", report, rows, _difference)
     return _join([table, tag("p", note, class_="quiet")] if rows else [])
 
 
-def _metrics(
-    name: str,
-    report: Report,
-    rows: Iterable[Row],
-    cell: Callable[[Row, str, int], Html],
-    heads: Sequence[Html] = (),
-    lead: Callable[[Row], Sequence[Html]] = lambda _row: (),
-) -> Html:
-    """Return a sortable table of rows: what leads them, then a cell for each metric."""
+def _metrics(name: str, report: Report, leads: Mapping[str, list[Html]], cell: Cell, *heads: Html) -> Html:
+    """Return a sortable table: by label of the row, the cells that lead it, then a cell for each metric."""
     digits = words.places(report)
-    heads = [_sorter("row", is_number=False), *heads, *(_sorter(words.heading(name)) for name in report.metrics)]
-    body = [_row(row, [*lead(row), *(cell(row, name, digits[name]) for name in report.metrics)]) for row in rows]
+    heads = (_sorter("row", is_number=False), *heads, *(_sorter(words.heading(name)) for name in report.metrics))
+    body = []
+    for row in (row for row in report.rows if row.label in leads):
+        label = Html(escape(row.label).replace("_", "_<wbr>"))  # a long name breaks between its words
+        reference = [Html(" "), tag("span", "reference", class_="tag")] if row.is_reference else []
+        differs = [tag("small", f"differs: {'; '.join(row.differs)}", class_="caution")] if row.differs else []
+        head = tag("th", label, *reference, *differs, scope="row", data_value=row.label)
+        cells = (cell(row, metric, digits[metric]) for metric in report.metrics)
+        words_of_row = " ".join([row.label, *row.factors]).lower()
+        body.append(tag("tr", head, *leads[row.label], *cells, data_filter=words_of_row))
     return _table(name, heads, body, class_="sortable")
-
-
-def _are_numbers(shown: Sequence[str]) -> bool:
-    return all(value == ABSENT or re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", value) for value in shown)
 
 
 def _sorter(name: str, *, is_number: bool = True) -> Html:
@@ -156,19 +158,6 @@ def _sorter(name: str, *, is_number: bool = True) -> Html:
 def _table(name: str, heads: Sequence[str], rows: Sequence[str], *, class_: str | None = None) -> Html:
     table = tag("table", tag("thead", tag("tr", *heads)), tag("tbody", *rows), class_=class_)
     return tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=name)
-
-
-def _row(row: Row, cells: Sequence[str]) -> Html:
-    label = Html(escape(row.label).replace("_", "_<wbr>"))  # a long name breaks between its words
-    reference = [Html(" "), tag("span", "reference", class_="tag")] if row.is_reference else []
-    differs = [tag("small", f"differs: {'; '.join(row.differs)}", class_="caution")] if row.differs else []
-    head = tag("th", label, *reference, *differs, scope="row", data_value=row.label)
-    return tag("tr", head, *cells, data_filter=" ".join([row.label, *row.factors]).lower())
-
-
-def _factor(value: str, *, is_number: bool) -> Html:
-    sorted_by = "" if is_number and value == ABSENT else value
-    return tag("td", value, data_value=sorted_by, class_=None if is_number else "text")
 
 
 def _result(row: Row, name: str, digits: int) -> Html:
@@ -200,11 +189,6 @@ def _figure(picture: Picture) -> Html:
     image = Html(f'<img src="{source}" alt="{escape(picture.title)}">')
     caption = tag("figcaption", tag("strong", f"{picture.title}."), f" {picture.caption}")
     return tag("figure", tag("div", image, class_="wide"), caption)
-
-
-def _troubles(report: Report) -> Html:
-    rows = [(each.run or "-", each.row, each.seed, each.state, each.why or "-") for each in report.troubles]
-    return _listing("Runs that are in no mean", ("run", "row", "seed", "state", "why"), rows, long=(4,))
 
 
 def _configurations(report: Report) -> Html:

@@ -111,8 +111,8 @@ def _panels(report: Report, config: Mapping[str, Any]) -> Drawn:
     if not count:
         return None
     order = sort_by_accuracy(report)
-    best = order[:NETWORKS]
-    runs = {row.label: next(iter(row.runs.values())) for row in report.rows if row in best}
+    best = {row.label for row in order[:NETWORKS]}
+    runs = {row.label: next(iter(row.runs.values())) for row in report.rows if row.label in best}
     usable = [x for x in runs.items() if x[1].run.checkpoint and tested_on_training_data(x[1].result)]
     if not usable:
         log.info("no panels.png: no run has its checkpoint and was tested on the data it was trained on")

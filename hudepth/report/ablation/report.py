@@ -105,24 +105,19 @@ def _compute(
         return
     if row is reference:
         draws = dict(basis)
-    elif row.differs:
-        draws = _own_draws(row, metrics, sampler)
-    else:
+    elif not row.differs:
         draws = _draws(row, first, metrics, sampler)
+    else:  # tested on other images; no draws if its seeds differ in them
+        own = next(iter(row.runs.values())).result
+        same = not any(_differences(own, each.result) for each in row.runs.values())
+        like = Resampler(own.table, repeats=sampler.repeats, seed=sampler.seed)
+        draws = _draws(row, own, metrics, like) if same else {}
     for name in metrics:
         values = {seed: each.result.metrics.get(name, math.nan) for seed, each in row.runs.items()}
         row.estimates[name] = estimate(name, values, draws)
         if row is not reference and not row.differs and not reference.differs:
             found = contrast(name, values, reference.estimates[name].values, draws, basis)
             row.contrasts |= {name: found} if found else {}
-
-
-def _own_draws(row: Row, metrics: Sequence[str], like: Resampler) -> dict[str, Draws]:
-    """Return resampled metrics of a row that was tested on other images; none if its seeds differ in them."""
-    first = next(iter(row.runs.values())).result
-    if any(_differences(first, each.result) for each in row.runs.values()):
-        return {}
-    return _draws(row, first, metrics, Resampler(first.table, repeats=like.repeats, seed=like.seed))
 
 
 def _mark_best(rows: Sequence[Row], metrics: Sequence[str]) -> None:

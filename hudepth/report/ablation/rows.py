@@ -106,8 +106,9 @@ def choose_reference(table: Sequence[Row], name: str | None, *, protocol: str) -
         known = ", ".join(f"'{label}'" for label in labels[:8]) + f" and {len(labels) - 8} more" * (len(labels) > 8)
         raise ConfigError(f"reference: no row '{name}'.{did_you_mean(name, labels)} There are {known}.")
     if len(found) > 1:
-        fix = f"Pass one, as in reference='\"{found[0].label}\"'."
-        raise ConfigError(f"reference: '{name}' is {len(found)} rows. {fix}")
+        raise ConfigError(
+            f"""reference: '{name}' is {len(found)} rows. Pass one, as in reference='"{found[0].label}"'."""
+        )
     if not found[0].runs:
         fix = f"Pass another, as in reference='\"{usable[0].label}\"'."
         raise ConfigError(f"reference: '{name}' has no finished run with {result}. {fix}")
@@ -140,8 +141,7 @@ def _label(rows: Sequence[Row], factors: Sequence[Factor]) -> None:
     times, taken = Counter(row.named for row in rows), Counter[str]()
     for number, row in enumerate(rows):
         row.factors = [factor.shown[number] for factor in factors]
-        cells = zip(factors, row.factors, strict=True)
-        words = [f"{factor.name}={cell}" for factor, cell in cells if cell != ABSENT]
+        words = [f"{each.name}={each.shown[number]}" for each in factors if each.shown[number] != ABSENT]
         if row.named:
             words = [row.named] if times[row.named] == 1 else [row.named, *words]
         label = ", ".join(words) or "all runs"
@@ -173,5 +173,5 @@ def _never_composed(labels: dict[str, str], error: str, rows: Sequence[Row]) -> 
     if row is not None and seed != ABSENT:
         row.seeds = sort_seeds([*row.seeds, seed])
     words = [f"{key}={value}" for key, value in labels.items() if key not in (VARIANT, "seed")]
-    label = row.label if row is not None else ", ".join([*filter(None, [named]), *words])
+    label = row.label if row is not None else ", ".join(filter(None, [named, *words]))
     return Trouble("", label, seed, NOT_COMPOSED, " ".join(error.split()))

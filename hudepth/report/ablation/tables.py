@@ -35,14 +35,17 @@ def print_table(report: Report) -> None:
 
 def table_md(report: Report) -> str:
     """Return table.md: the metrics, the differences from the reference, and what does not count."""
-    text = _results(report, report.metrics, "markdown").to_markdown()
+    text, digits = _results(report, report.metrics, "markdown").to_markdown(), words.places(report)
     if any(row.contrasts for row in report.rows):
-        text += f"\nDifference from {escape_markdown(report.reference.label)}:\n\n{_differences(report).to_markdown()}"
+        differences = Table(["", *map(words.heading, report.metrics)])
+        for row in (row for row in report.rows if row.contrasts):
+            found = ((digits[name], row.contrasts.get(name)) for name in report.metrics)
+            cells = (f"{words.number(x.value, places, sign=True)} {x.verdict}" if x else "-" for places, x in found)
+            differences.add(row.label, *cells)
+        text += f"\nDifference from {escape_markdown(report.reference.label)}:\n\n{differences.to_markdown()}"
     text += f"\n{escape_markdown(f'{words.about(report)}; {words.seeds(report)}. {words.method(report)}')}\n"
-    lines = [
-        f"- {escape_markdown(line)}\n" for line in (*report.warnings, *(f"not counted: {x}" for x in report.troubles))
-    ]
-    return "".join([text, *(["\n", *lines] if lines else [])])
+    lines = [*report.warnings, *(f"not counted: {trouble}" for trouble in report.troubles)]
+    return text + "\n" * bool(lines) + "".join(f"- {escape_markdown(line)}\n" for line in lines)
 
 
 def table_tex(report: Report) -> str:
@@ -68,17 +71,6 @@ def _results(report: Report, metrics: Sequence[str], form: Form) -> Table:
     for row in report.rows:
         cells = (_cell(row, name, digits[name], form) for name in metrics)
         table.add(_label(row, form), *(row.factors if factors else ()), row.counted, *cells)
-    return table
-
-
-def _differences(report: Report) -> Table:
-    digits = words.places(report)
-    table = Table(["", *map(words.heading, report.metrics)])
-    for row in report.rows:
-        if row.contrasts:
-            found = ((digits[name], row.contrasts.get(name)) for name in report.metrics)
-            cells = (f"{words.number(x.value, places, sign=True)} {x.verdict}" if x else "-" for places, x in found)
-            table.add(row.label, *cells)
     return table
 
 
@@ -111,9 +103,8 @@ def _cell(row: Row, name: str, digits: int, form: Form) -> tuple[Cell, ...]:
 def _fitting(report: Report) -> list[str]:
     """Return as many metrics as fit on the terminal, headline metrics first, at least one."""
     digits, first = words.places(report), metric_names("headline")
-    room = (
-        stdout(LOG_WIDTH).width - 12 - min(LONGEST, max(len(row.label) + 12 * row.is_reference for row in report.rows))
-    )
+    longest = max(len(row.label) + 12 * row.is_reference for row in report.rows)
+    room = stdout(LOG_WIDTH).width - 12 - min(LONGEST, longest)
     kept: list[str] = []
     for name in sorted(report.metrics, key=lambda name: name not in first):
         texts = (" ".join(part.text for part in _cell(row, name, digits[name], "terminal")) for row in report.rows)

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from hudepth.metrics.catalogue import metric_info, metric_names
+from hudepth.metrics.summary import Floats
 from hudepth.viz.limits import usual_range
 from hudepth.viz.style import COLOURS, shorten, strip_frame
 
@@ -19,8 +19,7 @@ STYLES = ("-", "--")
 OTHER = "0.8"
 
 History = Sequence[Mapping[str, float]]
-Band = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-"""Epochs, mean over the seeds, lowest, highest."""
+Band = tuple[Floats, Floats, Floats, Floats]  # epochs, mean over the seeds, lowest, highest
 
 
 def draw_variants(histories: Mapping[str, Sequence[History]], *, shown: Sequence[str], monitor: str = "") -> Figure:
