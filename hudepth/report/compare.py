@@ -60,7 +60,11 @@ def compare(options: CompareOptions) -> None:
     write_json(output / "compare.json", _document(a, b, differences, uncertainty))
     write_text(output / "compare.csv", _per_image(*tables).to_csv())
     ids, values = tables[0].ids, [table.values[PER_IMAGE[0]] for table in tables]
-    title, most = f"a: {_name(a)}\nb: {_name(b)}", differing(a, b, SHOWN)
+    paths = [each.path.resolve() for each in (a, b)]
+    # the run or study of a result is two folders above test/<protocol>
+    parts = [path.parents[1].parts if path.parent.name == "test" else path.parts for path in paths]
+    title = "\n".join(f"{side}: {Path(*each[-2:])}" for side, each in zip("ab", parts, strict=True))
+    most = differing(a, b, SHOWN)
     save_figure(output / "compare.png", draw_comparison(ids, *values, shown=most, metric=PER_IMAGE[0], title=title))
     print_comparison(a, b, differences, uncertainty)
     _draw_images(output / "images.png", a, b, options)
@@ -148,13 +152,6 @@ def _per_image(a: ImageTable, b: ImageTable) -> Table:
         keys = (a.ids[row], a.scenes[row], a.categories[row], str(a.pixels[row]))
         table.add(*keys, *(f"{column[row]:.9g}" for column in values))
     return table
-
-
-def _name(result: Result) -> str:
-    """Return the run or study of a result, two folders above test/<protocol>."""
-    path = result.path.resolve()
-    parts = path.parent.parent.parts if path.parent.name == "test" else path.parts
-    return str(Path(*parts[-2:]))
 
 
 def print_comparison(a: Result, b: Result, differences: dict[str, Difference], uncertainty: dict[str, Any]) -> None:

@@ -21,6 +21,7 @@ from hudepth.metrics.bootstrap import LEVEL, Draws, interval_of, student_quantil
 from hudepth.metrics.catalogue import metric_info
 
 BETTER, WORSE, NOT_SHOWN = "better", "worse", "not shown"
+BySeed = Mapping[str, Draws]
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def over_seeds(values: Sequence[float]) -> Interval:
     return Interval(mean - half, mean + half)
 
 
-def estimate(name: str, values: Mapping[str, float], draws: Mapping[str, Draws]) -> Estimate:
+def estimate(name: str, values: Mapping[str, float], draws: BySeed) -> Estimate:
     """Return a metric of a row from its values by seed, at least one.
 
     ``draws``, by seed, are of the same images and with the same draws; empty if seeds were tested on different images.
@@ -82,11 +83,7 @@ def estimate(name: str, values: Mapping[str, float], draws: Mapping[str, Draws])
 
 
 def contrast(
-    name: str,
-    row: Mapping[str, float],
-    reference: Mapping[str, float],
-    row_draws: Mapping[str, Draws],
-    reference_draws: Mapping[str, Draws],
+    name: str, row: Mapping[str, float], reference: Mapping[str, float], row_draws: BySeed, reference_draws: BySeed
 ) -> Contrast | None:
     """Return how a row differs from the reference in a metric, paired by seed; None if they have no seed in common.
 

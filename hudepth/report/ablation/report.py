@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from hudepth.base.errors import HudepthError
 from hudepth.metrics.bootstrap import REPEATS, SEED, Draws, Resampler, describe
 from hudepth.metrics.catalogue import metric_info, metric_names
-from hudepth.metrics.summary import ImageTable
-from hudepth.report.ablation.cautions import other_versions, undefined, unpaired, versions_of
 from hudepth.report.ablation.estimates import contrast, estimate
 from hudepth.report.ablation.factors import Factor
 from hudepth.report.ablation.rows import Row, Rows, Trouble, choose_reference
 from hudepth.runs.comparison import paired, stamp_differences
 from hudepth.runs.results import Result
+
+NAMED = 3  # most runs that a warning lists by name
 
 
 @dataclass(frozen=True)
@@ -62,9 +61,16 @@ def make_report(
     basis = {} if chosen.differs else _draws(chosen, first, metrics, sampler)
     for row in [chosen, *(row for row in table if row is not chosen)]:  # the others need its metrics
         _compute(row, chosen, basis, first, metrics, sampler)
-    _mark_best(table, metrics)
-    versions = versions_of(table)
-    warnings += [*undefined(table, metrics), *unpaired(table, chosen), *other_versions(versions, chosen)]
+    comparable = [row for row in table if row.runs and not row.differs]
+    for name in metrics if len(comparable) > 1 else ():
+        means = {row.label: row.estimates[name].mean for row in comparable}
+        finite = [mean for mean in means.values() if not math.isnan(mean)]
+        best = (max if metric_info(name).higher_is_better else min)(finite, default=math.nan)
+        for row in comparable:
+            if means[row.label] == best:
+                row.best.add(name)
+    versions = _versions_of(table)
+    warnings += [*_undefined(table, metrics), *_unpaired(table, chosen), *_other_versions(versions, chosen)]
     uncertainty = describe(first.table, repeats=repeats, seed=seed)
     return Report(protocol, metrics, rows.factors, table, chosen, rows.troubles, warnings, first, uncertainty, versions)
 
@@ -74,25 +80,17 @@ def _differences(first: Result, other: Result) -> list[str]:
     if lines := stamp_differences(first, other):
         return lines
     try:
-        _aligned(first, other)
+        paired(first, other)
     except HudepthError as error:
         return [str(error)]
     return []
-
-
-def _aligned(first: Result, other: Result) -> ImageTable:
-    """Return the images of a result in the order of the first."""
-    a, b = first.table, other.table
-    if a.ids == b.ids and a.scenes == b.scenes and np.array_equal(a.pixels, b.pixels):
-        return b
-    return paired(first, other)[1]
 
 
 def _draws(row: Row, first: Result, metrics: Sequence[str], sampler: Resampler) -> dict[str, Draws]:
     """Return resampled metrics by seed."""
     found = {}
     for seed, each in row.runs.items():
-        table = _aligned(first, each.result)
+        table = paired(first, each.result)[1]
         kept = {name: table.values[name] for name in metrics if name in table.values}
         found[seed] = sampler.draws(replace(table, values=kept), **each.result.averaging)
     return found
@@ -120,11 +118,51 @@ def _compute(
             row.contrasts |= {name: found} if found else {}
 
 
-def _mark_best(rows: Sequence[Row], metrics: Sequence[str]) -> None:
-    rows = [row for row in rows if row.runs and not row.differs]
-    for name in metrics if len(rows) > 1 else ():
-        means = [row.estimates[name].mean for row in rows if not math.isnan(row.estimates[name].mean)]
-        best = (max if metric_info(name).higher_is_better else min)(means, default=math.nan)
-        for row in rows:
-            if row.estimates[name].mean == best:
-                row.best.add(name)
+def _undefined(rows: Sequence[Row], metrics: Sequence[str]) -> list[str]:
+    """List rows without a mean, since a metric is undefined for one of their seeds."""
+    lines = []
+    for row in rows:
+        gaps: dict[str, list[str]] = {}
+        for name in metrics if row.runs else ():
+            if seeds := [seed for seed, value in row.estimates[name].values.items() if not math.isfinite(value)]:
+                gaps.setdefault(", ".join(seeds), []).append(name)
+        lines += [f"'{row.label}' has no {', '.join(gap)}: undefined for seed {seeds}" for seeds, gap in gaps.items()]
+    return lines
+
+
+def _unpaired(rows: Sequence[Row], reference: Row) -> list[str]:
+    """List rows whose seeds are not those of the reference."""
+    lines = []
+    for row in rows:
+        shared = [seed for seed in reference.runs if seed in row.runs]
+        comparable = row.runs and not row.differs and not reference.differs
+        if comparable and len(shared) < max(len(row.runs), len(reference.runs)):
+            only = f"are paired by seed {', '.join(shared)} only" if shared else "have no seed in common to pair"
+            lines.append(f"'{row.label}' and the reference {only}")
+    return lines
+
+
+def _versions_of(table: Sequence[Row]) -> dict[str, list[str]]:
+    """Return the names of the runs that count, by the version of hudepth that trained them."""
+    versions: dict[str, list[str]] = {}
+    for run in (each.run.path for row in table for each in row.runs.values()):
+        try:
+            found = json.loads((run / "environment.json").read_text(encoding="utf-8"))["packages"]["hudepth"]
+        except (OSError, ValueError, RecursionError, KeyError, TypeError):
+            found = None
+        versions.setdefault(found if isinstance(found, str) else "unknown", []).append(run.name)
+    return versions
+
+
+def _other_versions(versions: Mapping[str, Sequence[str]], reference: Row) -> list[str]:
+    """Return one line on the runs of another version than the reference's first run, if there are any."""
+    if len(versions) < 2:
+        return []
+    own = next(iter(reference.runs.values())).run.path.name
+    basis = next(version for version, runs in versions.items() if own in runs)
+    others = []
+    for version, runs in versions.items():
+        if version != basis:
+            more = f" and {len(runs) - NAMED} more" if len(runs) > NAMED else ""
+            others.append(f"{version}: {', '.join(runs[:NAMED])}{more}")
+    return [f"not all runs are of hudepth {basis}, the reference's: {'; '.join(others)}"]

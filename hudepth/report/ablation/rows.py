@@ -79,8 +79,17 @@ def sort_runs(sweep: Sweep, protocol: str, *, track: Callable[[list[Run]], Itera
     """Read the results of a protocol and sort runs into rows, in the order of the sweep; ``track`` shows progress."""
     groups: dict[str, list[tuple[Run, Result | str]]] = {}
     for run in track(sweep.runs):
-        groups.setdefault(variant_key(run.config), []).append((run, _result(run, protocol)))
-    rows = [_new_row([run for run, _ in group]) for group in groups.values()]
+        found: Result | str = ""  # or why there is none
+        if run.state == FINISHED:
+            try:
+                found = run.result(protocol)
+            except HudepthError as error:
+                found = str(error)
+        groups.setdefault(variant_key(run.config), []).append((run, found))
+    rows = []
+    for runs in ([run for run, _ in group] for group in groups.values()):
+        names = dict.fromkeys(run.labels[VARIANT] for run in runs if run.labels.get(VARIANT))
+        rows.append(Row(variant(runs[0].config), " / ".join(names), sort_seeds(seed_of(run.config) for run in runs)))
     factors = find_factors([row.config for row in rows])
     _label(rows, factors)
     troubles = [each for row, group in zip(rows, groups.values(), strict=True) for each in _fill(row, group)]
@@ -119,21 +128,6 @@ def sort_seeds(seeds: Iterable[str]) -> list[str]:
     """Return seeds, each once, lowest first, numbers as numbers."""
     parts = {seed: [(not p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"/", seed)] for seed in seeds}
     return sorted(parts, key=lambda seed: parts[seed])
-
-
-def _result(run: Run, protocol: str) -> Result | str:
-    """Return a finished run's result, or why there is none; the text is empty for runs that did not finish."""
-    if run.state != FINISHED:
-        return ""
-    try:
-        return run.result(protocol)
-    except HudepthError as error:
-        return str(error)
-
-
-def _new_row(runs: Sequence[Run]) -> Row:
-    names = dict.fromkeys(run.labels[VARIANT] for run in runs if run.labels.get(VARIANT))
-    return Row(variant(runs[0].config), " / ".join(names), sort_seeds(seed_of(run.config) for run in runs))
 
 
 def _label(rows: Sequence[Row], factors: Sequence[Factor]) -> None:
