@@ -22,19 +22,18 @@ SEED = "seed"
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One job of a sweep; jobs compare by object identity."""
+    """One job of a sweep; jobs compare by object identity.
+
+    ``labels`` are what was varied; ``config`` is resolved, None if it does not compose, for the reason in ``error``;
+    ``folder`` names the run directory; ``finished`` means trained, and tested as configured.
+    """
 
     overrides: tuple[str, ...]
     labels: Mapping[str, str]
-    """What was varied, as on the command line."""
     config: Mapping[str, Any] | None = None
-    """Resolved; None if it does not compose."""
     error: str = ""
-    """Why it does not compose."""
     folder: str = ""
-    """Name of its run directory in the folder of the sweep."""
     finished: bool = False
-    """Whether it is trained, and tested as configured."""
 
     @property
     def name(self) -> str:
@@ -58,16 +57,10 @@ def merge_overrides(typed: Sequence[Override], params: Sequence[Override]) -> li
 
 
 def combine(overrides: Sequence[Override], variants: Mapping[str, Sequence[str]]) -> list[Job]:
-    """Return every combination of values and variants.
+    """Return every combination of values and of ``variants``, which are lists of overrides by name.
 
-    Seeds change last, so that a sweep that ends early has all variants of the first seeds.
-
-    Args:
-        overrides: of the sweep and the command line.
-        variants: overrides by the name of a variant.
-
-    Raises:
-        ConfigError: for an unknown variant, or values that cannot be enumerated.
+    Seeds change last, so that a sweep that ends early has all variants of the first seeds. Raises ConfigError for an
+    unknown variant, or values that cannot be enumerated.
     """
     names = list(variants)
     constants, choices = [], dict[str, list[str]]()
@@ -110,8 +103,7 @@ def compose(
 ) -> list[Job]:
     """Return the jobs with their configurations from ``compose_one``, or with the error in one line from ``word``.
 
-    Raises:
-        ConfigError: if a job would be distributed over processes, or two jobs are the same training.
+    Raises ConfigError if a job would be distributed over processes, or two jobs are the same training.
     """
     composed: dict[str, Job] = {}
     for number, job in enumerate(jobs):
@@ -164,11 +156,8 @@ def find_done(jobs: Iterable[Job], folder: Path) -> list[Job]:
     found = []
     for job in jobs:
         if job.config is not None and (run := known.get(run_key(job.config))):
-            job = replace(job, folder=run[0].name, finished=_is_finished(*run, job.config))
+            (path, config), wanted = run, job.config
+            tested = not wanted["test"] or (config.get("test") and config.get("protocol") == wanted["protocol"])
+            job = replace(job, folder=path.name, finished=bool(read_state(path)[0] == FINISHED and tested))
         found.append(job)
     return found
-
-
-def _is_finished(path: Path, config: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
-    tested = not wanted["test"] or (config.get("test") and config.get("protocol") == wanted["protocol"])
-    return bool(read_state(path)[0] == FINISHED and tested)

@@ -29,13 +29,7 @@ def say(line: str) -> None:
 
 
 class Progress:
-    """Watches jobs while they run.
-
-    Args:
-        jobs: that are launched.
-        folder: of the sweep.
-        monitor: the metric to show.
-    """
+    """Watches jobs in the folder of a sweep while they run, and shows the metric ``monitor``."""
 
     def __init__(self, jobs: Sequence[Job], folder: Path, *, monitor: str) -> None:
         self._jobs = {job: _Watched(folder / job.folder, job, monitor) for job in jobs}
@@ -59,13 +53,11 @@ class Progress:
             self._print_news()
 
     def _print_news(self) -> None:
+        every = self._jobs.values()
         for number, (job, watched) in enumerate(self._jobs.items(), start=1):
             while news := watched.news():
-                say(f"[{number}/{len(self._jobs)}] {job.name}: {news}{self._time_left()}")
-
-    def _time_left(self) -> str:
-        done = sum(job.done for job in self._jobs.values())
-        return _left("; sweep: ", self._start, done, sum(job.left for job in self._jobs.values()))
+                left = _left("; sweep: ", self._start, sum(e.done for e in every), sum(e.left for e in every))
+                say(f"[{number}/{len(self._jobs)}] {job.name}: {news}{left}")
 
 
 def _left(words: str, start: float, done: int, left: int) -> str:

@@ -51,12 +51,11 @@ def search(
         folder: of the sweep; the study lies in it.
         overrides: of the sweep and of the command line; those with a range of values are searched over.
         options: of the search.
-        mode: ``min`` or ``max``: which way ``monitor`` is better.
-        monitor: the metric searched by.
-        at_once: number of trials to run in parallel.
+        mode: ``min`` or ``max``: which way the metric ``monitor`` is better.
+        monitor: the metric.
+        at_once: number of trials in parallel.
 
-    Raises:
-        ConfigError: if optuna is not installed, nothing is searched over, or all trials failed.
+    Raises ConfigError if optuna is not installed, nothing is searched over, or all trials failed.
     """
     constants = [str(override.input_line) for override in overrides if not override.is_sweep_override()]
     space = {each.get_key_element(): distribution(each) for each in overrides if each.is_sweep_override()}
@@ -80,8 +79,7 @@ def search(
 def distribution(override: Override) -> Any:
     """Return the optuna distribution for an override like ``loss.boundary=tag(log,interval(0.3,30))``.
 
-    Raises:
-        ConfigError: if it is not a range that optuna supports.
+    Raises ConfigError if it is not a range that optuna supports.
     """
     distributions = import_optuna().distributions
     value = override.value()

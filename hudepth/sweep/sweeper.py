@@ -38,10 +38,8 @@ from hudepth.sweep.progress import Progress, say
 class Sweep(Sweeper):
     """Runs the jobs of ``-m`` and of ``+sweep=<name>``.
 
-    Args:
-        params: key: comma-separated values.
-        variants: name: overrides.
-        search: options of a search in place of all combinations; see :class:`hudepth.sweep.search.SearchOptions`.
+    ``params`` map keys to comma-separated values, ``variants`` names to overrides; ``search`` replaces all combinations
+    by a search, see :class:`hudepth.sweep.search.SearchOptions`.
     """
 
     def __init__(
@@ -59,11 +57,7 @@ class Sweep(Sweeper):
         self.context, self.task, self.master = hydra_context, task_function, config
 
     def sweep(self, arguments: list[str]) -> None:
-        """Run all jobs that are not finished; ``arguments`` are the overrides of the command line.
-
-        Raises:
-            HudepthError: if nothing can run, or at the end, if a job failed.
-        """
+        """Run all jobs that are not finished; raise HudepthError if none can, or at the end, if one failed."""
         from hudepth.sweep.search import SearchOptions, search  # imports torch, which trainings without -m do later
 
         self._check_slurm()
@@ -99,11 +93,7 @@ class Sweep(Sweeper):
         return compose(jobs, compose_one, lambda error: one_line(error, "train"))
 
     def run(self, jobs: Sequence[Job], folder: Path) -> None:
-        """Run the jobs that are not finished; report the outcome.
-
-        Raises:
-            ConfigError: at the end, if a job failed, did not compose or did not end.
-        """
+        """Run the jobs that are not finished; report the outcome; raise ConfigError if a job failed or did not end."""
         jobs = find_done(jobs, folder)
         done, left = sum(job.finished for job in jobs), sum(job.is_open for job in jobs)
         for job in jobs:
@@ -137,16 +127,16 @@ class Sweep(Sweeper):
         place = str(folder).replace("\\", "\\\\").replace("'", "\\'")
         while left:
             launcher, start = self._launcher(len(left)), time.time()
-            commands = [
-                [*job.overrides, f"hydra.sweep.dir='{place}'", f"hydra.sweep.subdir={job.folder}"] for job in left
-            ]
+            folders = [[f"hydra.sweep.dir='{place}'", f"hydra.sweep.subdir={job.folder}"] for job in left]
+            commands = [[*job.overrides, *own] for job, own in zip(left, folders, strict=True)]
             try:
                 with Progress(left, folder, monitor=str(self.master.monitor)):
                     launcher.launch(commands, initial_job_idx=0)
                 return
             except Exception as error:
                 say(f"the launcher stopped: {one_line(error, 'train')}")
-            waiting = [job for job in left if not _has_begun(folder / job.folder, after=start)]
+            status = {job: folder / job.folder / "status.json" for job in left}
+            waiting = [job for job, file in status.items() if not file.is_file() or file.stat().st_mtime < start]
             if len(waiting) == len(left):
                 return
             left = waiting
@@ -206,11 +196,6 @@ class Sweep(Sweeper):
             say("to resume: " + shlex.join(["hudepth-train", *typed, f"sweep_dir={_format_path(folder)}"]))
         failed = [f"{job.name}: {why}" for job, (state, why) in zip(jobs, outcomes, strict=True) if state == FAILED]
         return failed, unfinished
-
-
-def _has_begun(run: Path, *, after: float) -> bool:
-    status = run / "status.json"
-    return status.is_file() and status.stat().st_mtime >= after
 
 
 @contextmanager

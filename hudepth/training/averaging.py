@@ -18,13 +18,8 @@ class EMA(WeightAveraging):
 
     Each step sets the average to ``d * average + (1 - d) * weights``, d = min(decay, (1 + n) / (10 + n)) after n
     earlier steps, starting from the weights of the first. Statistics of batch norm are averaged, too. Validation and
-    pictures use the average, and ``best.ckpt`` holds it; ``last.ckpt`` holds the trained weights as well.
-
-    Args:
-        decay: in [0, 1); 0.998 averages over some 500 steps.
-
-    Raises:
-        ConfigError: if ``decay`` is out of range.
+    pictures use the average, and ``best.ckpt`` holds it; ``last.ckpt`` holds the trained weights as well. ``decay`` is
+    in [0, 1), else a ConfigError is raised; 0.998 averages over some 500 steps.
     """
 
     def __init__(self, *, decay: float = 0.998) -> None:
@@ -47,13 +42,7 @@ class EMA(WeightAveraging):
         if averaged[0].is_floating_point():
             torch._foreach_lerp_(list(averaged), list(current), share)
         else:  # counters
-            for mean, now in zip(averaged, current, strict=True):
-                mean.copy_(now)
-
-    def averaged_state(self) -> dict[str, Tensor]:
-        """Return the module's state with the averaged weights."""
-        assert self._average_model is not None
-        return dict(self._average_model.module.state_dict())
+            torch._foreach_copy_(list(averaged), list(current))
 
 
 def averaged_state(trainer: Trainer | None, checkpoint: dict[str, Any]) -> dict[str, Tensor] | None:
@@ -63,5 +52,5 @@ def averaged_state(trainer: Trainer | None, checkpoint: dict[str, Any]) -> dict[
     """
     for callback in getattr(trainer, "callbacks", []):
         if isinstance(callback, EMA) and callback._average_model is not None:
-            return None if "current_model_state" in checkpoint else callback.averaged_state()
+            return None if "current_model_state" in checkpoint else dict(callback._average_model.module.state_dict())
     return None

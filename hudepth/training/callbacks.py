@@ -33,11 +33,7 @@ def epoch_metrics(trainer: Trainer) -> dict[str, float]:
 class History(Callback):
     """Writes metrics.csv, one row per epoch, and keeps the rows in every checkpoint.
 
-    A resumed run rewrites the file from its checkpoint, so the history continues exactly where the weights do,
-    whatever a killed run left in the file.
-
-    Args:
-        path: the file to write.
+    A resumed run rewrites the file from its checkpoint, so the history continues exactly where the weights do.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,18 +61,12 @@ class History(Callback):
 
 
 class EpochLine(Callback):
-    """Logs one line per epoch: losses, metrics, time taken and time left.
-
-    Args:
-        monitor: the metric that decides which checkpoint is best, shown after the losses.
-    """
+    """Logs one line per epoch: losses, the metric ``monitor``, other metrics, time taken and time left."""
 
     LOSSES, SHOWN = (loss_name("train"), loss_name("val")), ("val/abs_rel", "val/rmse", "val/delta1")
 
     def __init__(self, monitor: str) -> None:
         self.shown = tuple(dict.fromkeys((*self.LOSSES, monitor, *self.SHOWN)))
-        self._start = 0.0
-        self._first = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remember when training began or was resumed."""
@@ -98,14 +88,12 @@ class Interrupt(Callback):
     """Lets Ctrl-C end a run between two batches; a second Ctrl-C ends it at once.
 
     A KeyboardInterrupt raised at an arbitrary place can be lost: in the callback of a weak reference, of which drawing
-    has many, it is printed and ignored, and training continues.
-
-    A worker of a launcher that was killed ends in the same way, so that another process can resume the sweep.
+    has many, it is printed and ignored, and training continues. A worker of a launcher that was killed ends in the same
+    way, so that another process can resume the sweep.
     """
 
-    def __init__(self) -> None:
-        self._asked = False
-        self._before: Any = None
+    _asked = False
+    _before: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Install the handler, in the main thread only: after Lightning, which restores what it found."""
@@ -127,28 +115,18 @@ class Interrupt(Callback):
         log.warning("stopping after this batch; Ctrl-C again stops at once")
 
     def on_train_batch_end(self, *_: Any, **__: Any) -> None:
-        """Stop, if asked to."""
-        if self._asked or _is_orphan():
+        """Stop if asked to, or if the parent of this worker is gone."""
+        parent = multiprocessing.parent_process()  # set for a worker of a pool, not for a shell's child
+        if self._asked or (parent is not None and os.getppid() != parent.pid):
             raise KeyboardInterrupt
 
     on_validation_batch_end = on_train_batch_end
 
 
-def _is_orphan() -> bool:
-    """Return whether this is a worker process whose parent is gone."""
-    parent = multiprocessing.parent_process()  # set for a worker of a pool, not for a shell's child
-    return parent is not None and os.getppid() != parent.pid
-
-
 class PanelPictures(Callback):
-    """Draws RGB, ground truth, prediction and error of the same validation pairs each time.
+    """Draws RGB, ground truth, prediction and error of the same validation pairs to ``folder/epoch_<n>.png``.
 
-    Args:
-        folder: where ``epoch_<n>.png`` is written.
-        store: holds the pairs.
-        indices: of the pairs in the store.
-        every_n_epochs: how often; the last epoch is always drawn.
-        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
+    ``indices`` are those of the pairs in the store. The last epoch is always drawn.
     """
 
     def __init__(
@@ -167,5 +145,5 @@ class PanelPictures(Callback):
         save_panels(self.folder / f"epoch_{epoch:03d}.png", panels)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                picture = draw_panels(panels)
-                logger.experiment.add_image("val/panels", picture, trainer.global_step, dataformats="HWC")
+                step = trainer.global_step
+                logger.experiment.add_image("val/panels", draw_panels(panels), step, dataformats="HWC")

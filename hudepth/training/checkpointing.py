@@ -46,10 +46,9 @@ class KeptCheckpoint(ModelCheckpoint):
 
 
 def checkpoint_callbacks(run: Path, *, monitor: str, mode: str) -> list[ModelCheckpoint]:
-    """Return the callbacks that keep the best weights and the last state.
+    """Return the callbacks for best.ckpt, the weights of the best epoch, and last.ckpt, all that resuming needs.
 
-    ``best.ckpt`` of a run directory holds only weights, of the epoch that is best by ``monitor``; ``last.ckpt`` all
-    that resuming needs. The last is saved last, so that it records the best.
+    The last is saved last, so that it records the best.
     """
     folder = run / CHECKPOINTS
     best = KeptCheckpoint(

@@ -45,8 +45,7 @@ PARTS = (
 def train(cfg: DictConfig) -> float | None:
     """Train as configured, or resume a run; test the best checkpoint; return the best value of the monitored metric.
 
-    Raises:
-        HudepthError: with one line for the user, which the run's status and log repeat.
+    Raises HudepthError with one line for the user, which the run's status and log repeat.
     """
     training = _resumed(cfg) if cfg.resume else _new(cfg)
     path = training.path
@@ -55,8 +54,8 @@ def train(cfg: DictConfig) -> float | None:
     lock = lock_run(path, timeout_s=LOCK_TIMEOUT_S) if is_first_process() else nullcontext()
     with lock, _shared_with_children(path), run_dir.log_to_file(path / "train.log"):
         if training.overrides is None and is_first_process():
-            accelerator = training.options.trainer.accelerator
-            found = environment(seed=training.options.seed, accelerator=accelerator)
+            options = training.options
+            found = environment(seed=options.seed, accelerator=options.trainer.accelerator)
             run_dir.write_start(path, config=training.config, overrides=_overrides(), environment=found)
         return _run(training)
 
@@ -80,14 +79,9 @@ def _new(cfg: DictConfig) -> Training:
 
 
 def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
-    """Return the configuration of a run to resume.
+    """Return the configuration of a run to resume, with command-line overrides like ``trainer.max_epochs=50``.
 
-    The run directory may come from somebody else, so the classes that it trusts are not trusted here: only ``trust=``
-    on the command line counts.
-
-    Args:
-        path: the run directory.
-        overrides: from the command line, for example ``["resume=runs/x", "trainer.max_epochs=50"]``.
+    The run directory may come from somebody else, so only ``trust=`` on the command line counts.
 
     Raises:
         CheckpointError: if it is not a run, or has no checkpoint to resume from.
@@ -103,8 +97,7 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
     epochs = config["trainer"].get("max_epochs")
     resumed = OmegaConf.create({**config, "trust": []})
     for override in overrides:
-        key, _, value = override.partition("=")
-        key = key.lstrip("+")
+        key, _, value = override.lstrip("+").partition("=")
         if key == "resume":
             continue
         found = OmegaConf.select(resumed, key, default=resumed)
@@ -134,10 +127,8 @@ def _in_sweep() -> bool:
 def _run_path(config: dict[str, Any], options: TrainOptions) -> Path:
     if RUN_ENV in os.environ:
         return Path(os.environ[RUN_ENV])
-    if _in_sweep():
-        path = Path(HydraConfig.get().runtime.output_dir)
-        path.mkdir(parents=True, exist_ok=True)
-        return path.resolve()
+    if _in_sweep():  # hudepth.sweep.job has made it
+        return Path(HydraConfig.get().runtime.output_dir).resolve()
     return shared_path(partial(run_dir.create, config["paths"]["runs"], options.name), config["trainer"])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
 from lightning.pytorch import Trainer, seed_everything
@@ -42,21 +42,28 @@ def fit(training: Training) -> float | None:
     keep_freed_memory()
     import_trusted(options.trust)
     data = build_datamodule(training)
-    net = build_network(training, data)
+    net: nn.Module = instantiate(config["model"], trust=options.trust, only=nn.Module)
+    net.to(memory_format=MEMORY_FORMATS[options.memory_format])  # type: ignore[call-overload]
+    check_input(net, data.sizes)
     restore_split(training, data)
     parents = restore_parents(training, net, data)
     if options.compile:
         net.compile()  # in place: names of parameters, and so checkpoints, stay as they are
     module = build_module(config, net, data, trust=options.trust, before=parents)
-    check_monitor(options.monitor, module)
-    callbacks = build_callbacks(training.config, path, data)
+    known = module.logged_names()
+    if options.monitor not in known:  # found out before an epoch is lost over it
+        hint = did_you_mean(options.monitor, known)
+        raise ConfigError(f"monitor: no '{options.monitor}'.{hint} Pass one of {', '.join(known)}.")
+    callbacks = build_callbacks(config, path, data)
     with without_known_warnings():
         trainer = build_run_trainer(config, path, callbacks, alone=training.alone)
     check_shares(trainer, subset="validation", pairs=len(data.split.val))
     log_start(trainer, module, data)
     run_epochs(training, trainer, module, data)
-    if options.test and trainer.is_global_zero:
-        score_best(training, data)
+    if options.test and trainer.is_global_zero:  # like hudepth-test does: on one device, in full precision
+        tested = {**config, "trainer": {"accelerator": config["trainer"]["accelerator"]}}
+        checkpoint = load_checkpoint(str(path))
+        score_checkpoint(checkpoint, parse(ScoreOptions, tested), output=path / "test", datamodule=data)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
     return None if best.best_model_score is None else float(best.best_model_score)
 
@@ -74,21 +81,9 @@ def build_datamodule(training: Training) -> DepthDataModule:
     return data
 
 
-def build_network(training: Training, data: DepthDataModule) -> nn.Module:
-    """Build the network, and check that it takes each image size of the training."""
-    net: Any = instantiate(training.config["model"], trust=training.options.trust, only=nn.Module)
-    net.to(memory_format=MEMORY_FORMATS[training.options.memory_format])
-    check_input(net, data.sizes)
-    return cast(nn.Module, net)
-
-
 @torch.inference_mode()
 def check_input(net: nn.Module, sizes: list[tuple[int, int]]) -> None:
-    """Pass one image of each (height, width) in pixels through the network; the last one is ``data.size``.
-
-    Raises:
-        HudepthError: the network's own, if it does not take a size.
-    """
+    """Pass an image of each (height, width) [pixels] through the network, which raises if it does not take it."""
     net.eval()
     for number, size in enumerate(sizes):
         try:
@@ -118,29 +113,21 @@ def build_module(
 ) -> DepthModule:
     """Build loss, optimiser and schedule of a configuration around a network.
 
-    Args:
-        config: of the run.
-        net: to be trained.
-        datamodule: its data.
-        trust: further modules whose classes a ``_target_`` may name.
-        before: what the initial weights were trained on.
-
-    Raises:
-        HudepthError: if a part cannot be built.
+    ``trust`` lists further modules whose classes a ``_target_`` may name; ``before`` is what the initial weights were
+    trained on. Raises ConfigError if a part cannot be built.
     """
     distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
 
-    def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> Optimizer:
-        grouped = str(config["optim"]["_target_"]).startswith(f"{GroupedAdamW.__module__}.")
-        extra = {"encoder": find_encoder(net)} if grouped else {}
-        built: Optimizer = instantiate(config["optim"], parameters, trust=trust, only=Optimizer, **extra)
-        return built
+    def build(part: str, kind: type, argument: Any, own: type, **extra: Any) -> Any:
+        """Build an optimiser or a schedule; only those of hudepth, from the module of ``own``, take ``extra``."""
+        extra = extra if str(config[part]["_target_"]).startswith(f"{own.__module__}.") else {}
+        return instantiate(config[part], argument, trust=trust, only=kind, **extra)
 
-    def schedule(optimizer: Optimizer, total_steps: int) -> LRScheduler:
-        takes_length = str(config["schedule"]["_target_"]).startswith(f"{StepSchedule.__module__}.")
-        extra = {"total_steps": total_steps} if takes_length else {}
-        built: LRScheduler = instantiate(config["schedule"], optimizer, trust=trust, only=LRScheduler, **extra)
-        return built
+    def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> Any:
+        return build("optim", Optimizer, parameters, GroupedAdamW, encoder=find_encoder(net))
+
+    def schedule(optimizer: Optimizer, total_steps: int) -> Any:
+        return build("schedule", LRScheduler, optimizer, StepSchedule, total_steps=total_steps)
 
     info = datamodule.store.info
     data = {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")}
@@ -157,17 +144,6 @@ def build_module(
     )
 
 
-def check_monitor(monitor: str, module: DepthModule) -> None:
-    """Check that ``monitor`` is logged, before an epoch is lost over it.
-
-    Raises:
-        ConfigError: if it is not.
-    """
-    known = module.logged_names()
-    if monitor not in known:
-        raise ConfigError(f"monitor: no '{monitor}'.{did_you_mean(monitor, known)} Pass one of {', '.join(known)}.")
-
-
 def log_start(trainer: Trainer, module: DepthModule, data: DepthDataModule) -> None:
     """Log what is trained on what."""
     split, world = data.split, trainer.world_size
@@ -182,17 +158,10 @@ def log_start(trainer: Trainer, module: DepthModule, data: DepthDataModule) -> N
 
 def run_epochs(training: Training, trainer: Trainer, module: DepthModule, data: DepthDataModule) -> None:
     """Train, from the last checkpoint if the run is resumed."""
-    resumes = training.overrides is not None
+    last = None if training.overrides is None else training.last
     if training.overrides is not None and is_first_process():
         run_dir.write_resumed(training.path, config=training.config, overrides=training.overrides)
     with without_known_warnings():
-        trainer.fit(module, datamodule=data, ckpt_path=training.last if resumes else None, weights_only=True)
+        trainer.fit(module, datamodule=data, ckpt_path=last, weights_only=True)
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()  # one process tests: it should not wait for the others
-
-
-def score_best(training: Training, data: DepthDataModule) -> None:
-    """Test the best checkpoint like hudepth-test does: on one device, in full precision."""
-    trainer = {"accelerator": training.config["trainer"]["accelerator"]}
-    options = parse(ScoreOptions, {**training.config, "trainer": trainer})
-    score_checkpoint(load_checkpoint(str(training.path)), options, output=training.path / "test", datamodule=data)

@@ -12,17 +12,13 @@ from hudepth.models.encoder import Encoder, find_encoder
 
 
 class FreezeEncoder(Callback):
-    """Freezes the first stages of a pretrained encoder for a share of the epochs.
+    """Freezes the first stages of a pretrained encoder for a share of the epochs, and skips their gradients.
 
-    Their gradients are not computed, which saves time. Batch norm still updates its statistics;
-    ``model.encoder_norm=frozen`` prevents that.
+    Batch norm still updates its statistics; ``model.encoder_norm=frozen`` prevents that.
 
     Args:
-        until: share of the epochs, in (0, 1]; 1 freezes them throughout.
+        until: share of the epochs, in (0, 1]; 1 freezes them throughout. Raises ConfigError if out of range.
         stages: names of the encoder's first stages, without a gap: gradients must pass through what comes after.
-
-    Raises:
-        ConfigError: if ``until`` is out of range.
     """
 
     def __init__(self, *, until: float = 0.3, stages: Sequence[str] = ("stem", "layer1")) -> None:
@@ -31,11 +27,7 @@ class FreezeEncoder(Callback):
         self.until, self.stages = until, list(stages)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Freeze before a strategy looks for what it has to share among processes.
-
-        Raises:
-            ConfigError: if the network has no encoder, or the stages are not its first ones.
-        """
+        """Freeze before a strategy looks for what it has to share among processes; raise ConfigError if it cannot."""
         if stage != "fit":
             return
         known = [stage.name for stage in _encoder(pl_module).stages]
@@ -50,9 +42,7 @@ class FreezeEncoder(Callback):
                 "trainer.devices=1."
             )
         if self.until < 1 and (trainer.max_epochs or -1) < 0:
-            raise ConfigError(
-                "FreezeEncoder.until: a share of the epochs needs trainer.max_epochs. Pass it, or until=1."
-            )
+            raise ConfigError("FreezeEncoder.until: a share of the epochs needs trainer.max_epochs; or pass until=1.")
         _encoder(pl_module).freeze(len(self.stages))
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

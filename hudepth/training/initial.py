@@ -23,15 +23,17 @@ Parents = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Training:
-    """A configuration and the options parsed from it, and the run directory (``path``)."""
+    """A configuration, the options parsed from it, and the run directory.
+
+    ``overrides`` are those of a run that is resumed, None for a new run; ``alone`` means one process, whatever the
+    cluster.
+    """
 
     config: dict[str, Any]
     options: TrainOptions
     path: Path
     overrides: list[str] | None = None
-    """Command-line overrides of a run that is resumed; None for a new run."""
     alone: bool = False
-    """One process, whatever cluster it runs on."""
 
     @property
     def last(self) -> Path:
@@ -45,24 +47,15 @@ def restore_parents(training: Training, net: nn.Module, data: DepthDataModule) -
         return start_from(net, training.config, data) if training.options.init else []
     if epochs := sorted({look["epoch"] for look in run_dir.read_scored(training.path)}):
         log.warning(
-            "this run was tested after epoch %s. If that is why it is resumed, its next test is too good; "
-            "metrics.json will note it (scored_before)",
-            ", ".join(map(str, epochs)),
-        )
+            "this run was tested after epoch %s. If that is why it is resumed, its next test is too good; metrics.json "
+            "will note it (scored_before)", ", ".join(map(str, epochs)),
+        )  # fmt: skip
     parents: Parents = load_checkpoint(str(training.last)).data.get(BEFORE, [])
     return parents
 
 
 def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataModule) -> Parents:
-    """Load the weights of a checkpoint into a network that is to be trained.
-
-    Args:
-        net: to be filled.
-        config: with ``init``, a run, a checkpoint or a bundle as for ``checkpoint=`` of the other verbs, and ``paths``.
-        datamodule: of the training.
-
-    Returns:
-        What these weights were trained on, for the checkpoints of the training.
+    """Load the weights of ``config["init"]`` into a network; return what they were trained on.
 
     Raises:
         CheckpointError: if there is no such checkpoint, or it belongs to another network.

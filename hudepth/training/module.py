@@ -27,7 +27,7 @@ CHECK_EVERY = {"cpu": 1}
 
 
 def loss_name(stage: str, term: str = "total") -> str:
-    """Return the name under which a term of the loss is logged: ``train/loss/<term>`` or ``val/loss/<term>``."""
+    """Return the name under which a term of the loss is logged, for example ``train/loss/total``."""
     return f"{stage}/loss/{term}"
 
 
@@ -51,11 +51,10 @@ class DepthModule(LightningModule):
         loss: called with prediction, unit depth, image and valid mask; returns :class:`hudepth.base.types.LossTerms`.
         max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
         optimizer: makes an optimiser from named parameters.
-        scheduler: makes a learning-rate schedule from an optimiser and the total number of steps. A
-            :class:`hudepth.training.schedules.StepSchedule` advances after every step, others after every epoch. None
-            for a constant rate.
+        scheduler: makes a schedule from an optimiser and the total number of steps: a :class:`StepSchedule` advances
+            after every step, others after every epoch. None for a constant rate.
         distill: distance from a teacher's depths, added to the loss of training batches that have them.
-        record: stored in each checkpoint in addition to the weights, for example ``config``; plain types only.
+        record: plain values stored in each checkpoint, for example ``config``.
     """
 
     def __init__(
@@ -100,11 +99,8 @@ class DepthModule(LightningModule):
         """Return the names of everything that is logged for an epoch; calls the loss to learn its terms."""
         depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
         terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
-        return [
-            *(f"val/{name}" for name in validation_names()),
-            *(loss_name("val", term) for term in terms),
-            *(loss_name("train", term) for term in (*terms, *(["distill"] if self.distill else []))),
-        ]
+        names = [f"val/{name}" for name in validation_names()] + [loss_name("val", term) for term in terms]
+        return names + [loss_name("train", term) for term in terms + ["distill"] * bool(self.distill)]
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         pred = self(batch.get("small_image", batch["image"]))

@@ -21,12 +21,9 @@ class GroupedAdamW(AdamW):
         params: parameters with their names.
         lr: learning rate of all but the encoder.
         encoder: whose parameters get a rate of their own; None if the network has no encoder.
-        encoder_lr_factor: the encoder's learning rate over ``lr``; 0 leaves the encoder unchanged.
+        encoder_lr_factor: the encoder's learning rate over ``lr``, finite and not negative; 0 leaves it unchanged.
         weight_decay: of matrices and kernels.
         **options: further arguments of :class:`torch.optim.AdamW`, for example ``fused``.
-
-    Raises:
-        ConfigError: for a factor that is negative or not finite.
     """
 
     def __init__(
@@ -46,16 +43,9 @@ class GroupedAdamW(AdamW):
         for name, parameter in params:
             part = "encoder" if id(parameter) in inside else "rest"
             groups.setdefault(part if parameter.ndim > 1 else f"{part}_no_decay", []).append((name, parameter))
-        super().__init__(
-            [
-                {
-                    "params": members,
-                    "name": name,
-                    "lr": lr * (encoder_lr_factor if name.startswith("encoder") else 1.0),
-                    "weight_decay": 0.0 if name.endswith("_no_decay") else weight_decay,
-                }
-                for name, members in groups.items()
-            ],
-            lr=lr,
-            **options,
-        )
+        described: list[dict[str, Any]] = []
+        for name, members in groups.items():
+            rate = lr * (encoder_lr_factor if name.startswith("encoder") else 1.0)
+            decay = 0.0 if name.endswith("_no_decay") else weight_decay
+            described.append({"params": members, "name": name, "lr": rate, "weight_decay": decay})
+        super().__init__(described, lr=lr, **options)

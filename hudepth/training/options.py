@@ -79,11 +79,7 @@ class TrainOptions:
 
 
 def parse_options(config: Mapping[str, Any]) -> TrainOptions:
-    """Check the options of a configuration.
-
-    Raises:
-        ConfigError: for values of the wrong type or out of range, and for devices that are missing.
-    """
+    """Check the options of a configuration; raise ConfigError for wrong types or ranges, and for missing devices."""
     options = parse(TrainOptions, config)
     if options.compile and config["model"].get("recompute"):
         raise ConfigError("compile: torch.compile does not support model.recompute. Set one of them to false.")

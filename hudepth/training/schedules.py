@@ -15,10 +15,7 @@ from hudepth.base.errors import ConfigError
 class StepSchedule(LambdaLR):
     """Multiplies the learning rate of each group by a function of the finished share of the training.
 
-    Args:
-        optimizer: whose rates are changed.
-        total_steps: of the whole training.
-        warmup: share of the training in which the factor rises linearly from 0 to 1, in [0, 1).
+    ``warmup``, in [0, 1), is the share of the training in which the factor rises linearly from 0 to 1.
 
     Raises:
         ConfigError: if ``warmup`` is out of range, or the training has no end.
@@ -49,14 +46,7 @@ class StepSchedule(LambdaLR):
 class WarmupCosine(StepSchedule):
     """Linear warm-up, then half a cosine down: one cycle (Smith 2018, with the cosine of Loshchilov and Hutter 2017).
 
-    Args:
-        optimizer: whose rates are changed.
-        total_steps: of the whole training.
-        warmup: share of the training in which the rate rises, in [0, 1).
-        final: the rate at the end over the highest, in [0, 1].
-
-    Raises:
-        ConfigError: if a share is out of range.
+    ``final`` is the rate at the end over the highest, in [0, 1]. Raises ConfigError if a share is out of range.
     """
 
     def __init__(self, optimizer: Optimizer, *, total_steps: int, warmup: float = 0.05, final: float = 0.01) -> None:

@@ -21,9 +21,7 @@ TRIAL_ENV = "HUDEPTH_TRIAL"
 class TrialPruner(Callback):
     """Reports the monitored metric of each epoch to an optuna study, and stops the training if the study prunes it.
 
-    Args:
-        trial: the value of :data:`hudepth.training.study.TRIAL_ENV`.
-        monitor: the metric.
+    ``trial`` is the value of :data:`TRIAL_ENV`.
     """
 
     def __init__(self, trial: str, *, monitor: str) -> None:
@@ -37,8 +35,7 @@ class TrialPruner(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Report, and raise :class:`hudepth.base.errors.Pruned` if other trials were better at this epoch."""
-        value = epoch_metrics(trainer).get(self.monitor)
-        epoch = trainer.current_epoch + 1
+        value, epoch = epoch_metrics(trainer).get(self.monitor), trainer.current_epoch + 1
         if value is None or not trainer.is_global_zero:
             return
         if epoch not in self._reported:  # a resumed run may repeat an epoch
@@ -50,13 +47,8 @@ class TrialPruner(Callback):
 def open_study(file: str, options: Mapping[str, Any] | None = None, *, direction: str = "minimize") -> Any:
     """Open or create a study in a journal file, which many processes may write to and a kill cannot damage.
 
-    Args:
-        file: path of the journal.
-        options: of the search, stored in the study; None to use the stored ones.
-        direction: ``minimize`` or ``maximize``.
-
-    Raises:
-        ConfigError: if optuna is not installed, or the file is not a study.
+    ``options`` of the search are stored in the study; None uses the stored ones. ``direction`` is ``minimize`` or
+    ``maximize``. Raises ConfigError if optuna is not installed, or the file is not a study.
     """
     optuna = import_optuna()
     from optuna.storages import JournalStorage

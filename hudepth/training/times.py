@@ -24,16 +24,11 @@ class Times(Callback):
     all cores in this process without loader processes [s]; ``lr``, learning rate of the optimiser's last group.
 
     Times differ from run to run, so checkpoints do not hold them: a resumed run appends to the rows it finds.
-
-    Args:
-        path: the file to write.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: list[dict[str, str]] = []
-        self._wall = self._cpu = 0.0
-        self._images = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clocks, after the rows of finished epochs if the run is resumed."""
@@ -43,9 +38,7 @@ class Times(Callback):
         self._wall = time.monotonic() - float(last["wall_s"])
         self._cpu = time.process_time() - float(last["cpu_s"])
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """Count the images."""
         self._images += len(batch["index"]) * trainer.world_size
 

@@ -26,23 +26,15 @@ from hudepth.training.times import Times
 
 
 def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthDataModule) -> list[Callback]:
-    """Build the callbacks of a run in a directory: history before checkpoints, which hold it.
-
-    Raises:
-        ConfigError: if one cannot be built.
-    """
+    """Build the callbacks of a run in a directory: history before checkpoints, which hold it."""
     options, monitor, mode = config["callbacks"], config["monitor"], config["mode"]
     callbacks: list[Callback] = [
         Interrupt(), History(path / history.FILE), Times(path / "times.csv"), EpochLine(monitor)
     ]  # fmt: skip
     if options["panels"]:
         indices = evenly_spaced(sorted(datamodule.split.val), options["panels"])
-        every, max_depth_m = options["panels_every_n_epochs"], datamodule.max_depth_m
-        callbacks.append(
-            PanelPictures(
-                path / "images", datamodule.store, indices, every_n_epochs=every, max_depth_m=max_depth_m
-            )
-        )  # fmt: skip
+        how = {"every_n_epochs": options["panels_every_n_epochs"], "max_depth_m": datamodule.max_depth_m}
+        callbacks.append(PanelPictures(path / "images", datamodule.store, indices, **how))
     if shows_progress():
         callbacks.append(RichProgressBar(leave=False))
     if trial := os.environ.get(TRIAL_ENV):
@@ -54,11 +46,7 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
 
 
 def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Callback], *, alone: bool) -> Trainer:
-    """Build the Trainer of a run; ``alone`` means one process, whatever cluster it runs on.
-
-    Raises:
-        ConfigError: if Lightning refuses an option.
-    """
+    """Build the Trainer of a run; ``alone`` means one process, whatever cluster it runs on."""
     options = config["logger"]
     loggers: list[Logger] = [instantiate(extra, trust=config["trust"], only=Logger) for extra in options["extra"]]
     if options["tensorboard"]:

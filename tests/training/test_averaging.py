@@ -26,7 +26,8 @@ from hudepth.models import TinyUNet
 from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
 from hudepth.runs.history import read_history
 from hudepth.training.averaging import EMA, averaged_state
-from hudepth.training.callbacks import History, checkpoint_callbacks
+from hudepth.training.callbacks import History
+from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 
 
