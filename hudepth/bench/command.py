@@ -22,11 +22,7 @@ from hudepth.bench.worker import ContenderError
 def bench(config: dict[str, Any]) -> None:
     """Measure, print the table, write bench.json, bench.csv, bench.md and bench.png.
 
-    Args:
-        config: conf/bench.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user; a backend that is missing or fails is a note instead.
+    Raises HudepthError with one line for the user; a backend that is missing or fails is a note instead.
     """
     plan = make_plan(config)
     measured = measure(plan, runs=config["paths"]["runs"])
@@ -39,15 +35,9 @@ def bench(config: dict[str, Any]) -> None:
 
 
 def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda _: None) -> Measured:
-    """Build all contenders, then measure them in turns.
+    """Build all contenders and those that ``more`` starts, then measure them in turns.
 
-    Args:
-        plan: checked.
-        runs: the folder of runs that ``checkpoint=last`` searches.
-        more: starts further contenders.
-
-    Raises:
-        HudepthError: if the network cannot be built, or nothing could be measured.
+    Raises HudepthError if the network cannot be built, or nothing could be measured.
     """
     assert plan.threads
     torch.set_num_threads(plan.threads)

@@ -17,24 +17,22 @@ from hudepth.bench.worker import ContenderError, Spec, Worker
 
 @dataclass
 class Contenders:
-    """All contenders of a run; use as a context manager, which ends all processes."""
+    """All contenders of a run, with files in ``folder``; use as a context manager, which ends all processes."""
 
     subject: Subject
     folder: Path
-    """For files that last as long as the run."""
     threads: int
-    """Of each contender."""
     device: str
     """Of those in PyTorch."""
     note: Callable[[str, str], None]
-    """Takes a line about a contender for the notes under the table: its name, the line."""
+    """Takes a contender's name and a line about it for the notes."""
     entries: list[Entry] = field(default_factory=list)
     workers: list[Worker] = field(default_factory=list)
     """Those that were built."""
     started: list[tuple[Worker, Entry]] = field(default_factory=list)
+    _stack: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> Contenders:
-        self._stack = ExitStack()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -57,15 +55,9 @@ class Contenders:
             self.start(entry, backend.factory, options)
 
     def start(self, entry: Entry, factory: str, options: dict[str, Any]) -> None:
-        """Start the process of a contender, which imports what it needs meanwhile.
-
-        Args:
-            entry: names it and the size of its images.
-            factory: ``module:function`` that returns its :class:`hudepth.bench.worker.Runner`.
-            options: of the factory.
-        """
-        spec = Spec(entry.name, factory, images_file(self.folder, entry.size), self.threads, options)
-        self.started.append((self._stack.enter_context(self._worker(spec)), entry))
+        """Start the process of a contender; ``factory`` is the ``module:function`` of its Runner, with its options."""
+        worker = self._worker(entry.name, factory, options, size=entry.size)
+        self.started.append((self._stack.enter_context(worker), entry))
 
     def build(self) -> Iterator[None]:
         """Build one after the other; yield after each. What cannot be built is a note."""
@@ -83,14 +75,8 @@ class Contenders:
             yield
 
     def product(self) -> Worker:
-        """Return a process that multiplies matrices, which is not a contender.
-
-        Raises:
-            ContenderError: if it cannot be built.
-        """
-        images = images_file(self.folder, self.subject.size)
-        spec = Spec("matrix product", PRODUCT, images, self.threads, {"device": self.device})
-        worker = self._stack.enter_context(self._worker(spec))
+        """Return a process that multiplies matrices; raises ContenderError if it cannot be built."""
+        worker = self._stack.enter_context(self._worker("matrix product", PRODUCT, {"device": self.device}))
         worker.build()
         return worker
 
@@ -98,22 +84,20 @@ class Contenders:
         """Return a graph's file; it is made if it does not exist."""
         path, subject = self.folder / name, self.subject
         if not path.exists():
-            options = {
-                **self._network_options(), "graph": str(path), "name": subject.name, "max_depth_m": subject.max_depth_m
-            }  # fmt: skip
+            info = {"graph": str(path), "name": subject.name, "max_depth_m": subject.max_depth_m}
+            options = {**self._network_options(), **info}
             if name != ONNX:
                 options["onnx"] = str(self._make_graph(ONNX))
-            spec = Spec(name, GRAPHS[name], images_file(self.folder, subject.size), self.threads, options)
-            with self._worker(spec) as maker:
+            with self._worker(name, GRAPHS[name], options) as maker:
                 maker.build()
         return path
 
     def _network_options(self) -> dict[str, Any]:
-        subject = self.subject
-        return {
-            "model": subject.model, "trust": subject.trust, "state": str(subject.state), "size": subject.size,
-            "device": self.device,
-        }  # fmt: skip
+        shared = {key: getattr(self.subject, key) for key in ("model", "trust", "size")}
+        return {**shared, "state": str(self.subject.state), "device": self.device}
 
-    def _worker(self, spec: Spec) -> Worker:
-        return Worker(spec, log=self.folder / "printed.log")
+    def _worker(
+        self, name: str, factory: str, options: dict[str, Any], *, size: tuple[int, int] | None = None
+    ) -> Worker:
+        images = images_file(self.folder, size or self.subject.size)
+        return Worker(Spec(name, factory, images, self.threads, options), log=self.folder / "printed.log")

@@ -20,11 +20,7 @@ from hudepth.inference.runtimes import onnx_session, openvino_model
 
 
 class GraphRunner(Runner):
-    """Runs a graph on the CPU, with the options that hudepth-predict uses.
-
-    Args:
-        compute: images [b, 3, h, w] to unit depth [b, 1, h, w].
-    """
+    """Runs a graph on the CPU as hudepth-predict does; ``compute`` takes images [b, 3, h, w] to depth [b, 1, h, w]."""
 
     def __init__(self, compute: Callable[[NDArray[np.float32]], Any]) -> None:
         self._compute = compute
@@ -61,11 +57,7 @@ def openvino(spec: Spec) -> GraphRunner:
 
 
 def export(spec: Spec) -> GraphRunner:
-    """Export the merged network to ONNX.
-
-    Args:
-        spec: of the network, with the further options ``graph`` (file to write), ``name`` and ``max_depth_m``.
-    """
+    """Export the merged network to the ONNX file ``graph``; further options are ``name`` and ``max_depth_m``."""
     from hudepth.bench.torch_runners import build_merged
     from hudepth.export.graphs import export_onnx
     from hudepth.inference.model_info import ModelInfo
@@ -81,11 +73,7 @@ def export(spec: Spec) -> GraphRunner:
 
 
 def quantise(spec: Spec) -> GraphRunner:
-    """Quantise a graph for OpenVINO: as fast as any int8 graph, but on too few images to be as accurate.
-
-    Args:
-        spec: with the options ``onnx`` (a graph of normalised images) and ``graph`` (``.xml`` to write).
-    """
+    """Quantise the graph ``onnx`` to ``graph`` (``.xml``) for OpenVINO, on too few images to be accurate."""
     os.environ["CI"] = "true"  # in this process: stops NNCF from collecting statistics
     library: Any = importlib.import_module("openvino")
     nncf: Any = importlib.import_module("nncf")

@@ -25,12 +25,7 @@ def rooms() -> list[UInt8[np.ndarray, "h w 3"]]:
 
 
 def images_file(folder: Path, size: tuple[int, int]) -> Path:
-    """Return a .npy file of the rooms, normalised, float32 [n, 3, h, w]; it is written if it does not exist.
-
-    Args:
-        folder: to write to.
-        size: (height, width).
-    """
+    """Return a .npy file of the rooms, normalised, float32 [n, 3, h, w], in ``folder``; written if missing."""
     path = folder / f"images_{size[0]}x{size[1]}.npy"
     if not path.exists():
         rgb = torch.from_numpy(np.stack([resize_image(image, size) for image in rooms()]))

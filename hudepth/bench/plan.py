@@ -28,11 +28,9 @@ class Plan:
     checkpoint: str | None = None
     model: dict[str, Any] | None = None
     size: Size | None = None
-    """(height, width)."""
     repeats: Annotated[int, Range(1)] = 5
     seconds: Annotated[float, Range(0)] = 1.0
     longest_pass: Annotated[float, Range(0, above=True)] = 10.0
-    """[s]."""
     threads: Annotated[int, Range(1)] | None = None
     device: Annotated[str, Choice(("auto", "cpu", "cuda"))] = "auto"
     trust: list[str] | None = None
@@ -51,11 +49,7 @@ class Plan:
 
 
 def make_plan(config: dict[str, Any]) -> Plan:
-    """Check every option, and that the output folder can be written, before anything is built.
-
-    Raises:
-        ConfigError: for an option of the wrong type or out of range, or an output folder that cannot be made.
-    """
+    """Check every option, and make the output folder; raises ConfigError if an option is wrong or that fails."""
     plan = parse(Plan, config)
     output_folder(plan.output)
     return plan

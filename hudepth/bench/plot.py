@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 from hudepth.bench.rows import Row
-from hudepth.viz.panels import save_figure
 from hudepth.viz.style import COLOURS
 
 MARKERS = "osD^v"
 
 
 def draw_bench(rows: Sequence[Row], *, title: str) -> Figure:
-    """Draw the backends; error bars are p25 to p75.
-
-    Args:
-        rows: at least one of a backend.
-        title: above the figure.
-    """
+    """Draw the backends, at least one; error bars are p25 to p75."""
     figure = Figure(figsize=(8.2, 4.8), dpi=130, layout="constrained")
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     axis = figure.subplots()
@@ -43,11 +36,6 @@ def draw_bench(rows: Sequence[Row], *, title: str) -> Figure:
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
     return figure
-
-
-def save_bench(path: Path, rows: Sequence[Row], *, title: str) -> None:
-    """Write :func:`draw_bench` as a PNG file, whole or not at all."""
-    save_figure(path, draw_bench(rows, title=title))
 
 
 def _draw_lines(axis: Axes, rows: Sequence[Row]) -> None:

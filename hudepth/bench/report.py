@@ -13,10 +13,11 @@ from hudepth.base.files import write_json, write_text
 from hudepth.base.machine import hardware
 from hudepth.base.tables import Table, stdout
 from hudepth.bench.plan import SETTINGS, Plan
-from hudepth.bench.plot import save_bench
+from hudepth.bench.plot import draw_bench
 from hudepth.bench.rounds import Session
 from hudepth.bench.rows import Entry, Row, describe_efficiency, make_rows
 from hudepth.bench.subject import Subject
+from hudepth.viz.panels import save_figure
 
 LEGEND = (
     "ms/image and images/s are those of the median pass; p50, p25-p75 and p95 are quantiles of a pass [ms]; x eager is "
@@ -29,14 +30,13 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Measured:
-    """A finished run."""
+    """A finished run; ``rates`` [GFLOP/s] of matrix products are one per round."""
 
     plan: Plan
     subject: Subject
     entries: list[Entry]
     session: Session
     rates: list[float]
-    """Of matrix products [GFLOP/s], one per round."""
 
     @property
     def peak_gflop_per_s(self) -> float | None:
@@ -45,22 +45,12 @@ class Measured:
 
     def rows(self) -> list[Row]:
         """Return the rows of the table."""
-        return make_rows(
-            self.session.samples, self.entries,
-            peak_gflop_per_s=self.peak_gflop_per_s, max_depth_m=self.subject.max_depth_m,
-        )  # fmt: skip
+        peak, max_depth_m = self.peak_gflop_per_s, self.subject.max_depth_m
+        return make_rows(self.session.samples, self.entries, peak_gflop_per_s=peak, max_depth_m=max_depth_m)
 
 
 def write_report(measured: Measured, *, sentences: Sequence[str] = ()) -> None:
-    """Write all files, print table and notes.
-
-    Args:
-        measured: with at least one sample.
-        sentences: further results.
-
-    Raises:
-        OSError: if the output folder is full or gone.
-    """
+    """Write all files, print table, notes and further ``sentences``; raises OSError if the folder is full or gone."""
     plan, subject, rows = measured.plan, measured.subject, measured.rows()
     best = describe_efficiency(rows, peak_gflop_per_s=measured.peak_gflop_per_s, merged_flops=subject.merged_flops)
     lines = [*([best] if best else []), *sentences]
@@ -72,7 +62,7 @@ def write_report(measured: Measured, *, sentences: Sequence[str] = ()) -> None:
     write_json(plan.output / "bench.json", {**content, "rows": [asdict(row) for row in rows]})
     write_text(plan.output / "bench.csv", to_csv(rows))
     write_text(plan.output / "bench.md", to_page(table, machine=machine, lines=[*lines, *notes]))
-    save_bench(plan.output / "bench.png", rows, title=f"{table.title}, on {machine['processor']}")
+    save_figure(plan.output / "bench.png", draw_bench(rows, title=f"{table.title}, on {machine['processor']}"))
     table.show()
     for line in (LEGEND, *lines, *notes):
         stdout().print(line, markup=False, highlight=False)
@@ -128,13 +118,11 @@ def format_figure(value: float) -> str:
 
 def _content(measured: Measured) -> dict[str, Any]:
     """Return what only bench.json holds."""
-    subject, settings = asdict(measured.subject), asdict(measured.plan)
+    settings, model = asdict(measured.plan), asdict(measured.subject)
+    del model["state"], model["trust"]
     return {
         "hudepth": __version__,
-        "model": {
-            **{key: value for key, value in subject.items() if key not in ("state", "trust")},
-            "trained": measured.plan.checkpoint is not None,
-        },
+        "model": {**model, "trained": measured.plan.checkpoint is not None},
         "settings": {key: settings[key] for key in SETTINGS},
         "matmul_gflop_per_s": {"best": measured.peak_gflop_per_s, "of_each_round": measured.rates},
         "times_s": [

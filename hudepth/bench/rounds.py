@@ -30,17 +30,13 @@ class Sample:
 
 @dataclass
 class Session:
-    """A run of all contenders over all batch sizes.
-
-    A contender that fails is left out from there on, with a note; its measurements at smaller batches are kept.
-    """
+    """A run of all contenders; one that fails is left out from there on, with a note, its smaller batches are kept."""
 
     batches: Sequence[int]
     """Images per pass, rising: memory that a smaller batch left behind is no more than a larger one needs."""
     repeats: int
     """Rounds at each batch size."""
     seconds: float
-    """Of timed passes in a turn."""
     longest_pass_s: float
     """A batch whose pass would take longer is left out."""
     contenders: Sequence[Worker] = ()

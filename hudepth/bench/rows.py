@@ -18,16 +18,12 @@ EXACT_MM = 1.0
 
 @dataclass(frozen=True)
 class Entry:
-    """What is known of a contender apart from its times."""
+    """What is known of a contender apart from its times: its name, ``label`` in the table, ``about`` in the notes."""
 
     name: str
-    """Of its process."""
     label: str
-    """In the table."""
     size: tuple[int, int]
-    """(height, width)."""
     about: str = ""
-    """For the notes."""
     parameters: int | None = None
     flops: int | None = None
     """Per image, of the network as trained."""
@@ -77,13 +73,10 @@ class Row:
 def make_rows(
     samples: Sequence[Sample], entries: Sequence[Entry], *, peak_gflop_per_s: float | None, max_depth_m: float
 ) -> list[Row]:
-    """Return a row for each sample, by batch, then in the order of ``entries``.
+    """Return a row for each sample (of at least one round), by batch, then in the order of ``entries``.
 
-    Args:
-        samples: each with at least one round.
-        entries: the contenders.
-        peak_gflop_per_s: best rate of matrix products; None if it was not measured.
-        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
+    ``peak_gflop_per_s`` is the best rate of matrix products, None if it was not measured; ``max_depth_m`` is the
+    maximum depth [m]: the network predicts depth / max_depth_m.
     """
     by_place = {(sample.batch, sample.name): sample for sample in samples}
     batches = sorted({sample.batch for sample in samples})
@@ -118,11 +111,7 @@ def _difference_mm(sample: Sample, reference: Sample | None, max_depth_m: float)
 
 
 def quantiles_ms(rounds: Sequence[Sequence[float]]) -> tuple[int, float, float, float, float]:
-    """Return the number of passes and their p25, p50, p75 and p95 [ms], over all rounds, linearly interpolated.
-
-    Args:
-        rounds: times [s] of the passes of each round, at least one in all.
-    """
+    """Return the number of passes of all rounds [s], and their p25, p50, p75, p95 [ms], linearly interpolated."""
     times_ms = 1000 * np.asarray([time for times in rounds for time in times], np.float64)
     p25, p50, p75, p95 = (float(value) for value in np.percentile(times_ms, [25, 50, 75, 95]))
     return len(times_ms), p25, p50, p75, p95
@@ -131,11 +120,8 @@ def quantiles_ms(rounds: Sequence[Sequence[float]]) -> tuple[int, float, float, 
 def times_as_fast(rounds: Sequence[Sequence[float]], reference: Sequence[Sequence[float]]) -> float:
     """Return how many times as fast as the reference something is: the median over rounds of the ratio in a round.
 
-    Both ran shortly after one another in each round, so whatever slowed the machine for a while slowed both.
-
-    Args:
-        rounds: times of the passes of each round.
-        reference: the same for the reference: as many rounds, as many images per pass.
+    Both ran shortly after one another in each round, with as many images per pass, so whatever slowed the machine for
+    a while slowed both.
     """
     pairs = zip(rounds, reference, strict=True)
     return statistics.median(statistics.median(theirs) / statistics.median(own) for own, theirs in pairs)

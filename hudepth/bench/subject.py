@@ -21,17 +21,13 @@ USUAL_SIZE, USUAL_MAX_DEPTH_M = (224, 224), 10.0
 
 @dataclass(frozen=True)
 class Subject:
-    """The network that is measured."""
+    """The network that is measured: its class, configuration, and the file ``state`` of its tensors."""
 
     name: str
-    """Class of the network."""
     model: dict[str, Any]
-    """Its configuration."""
     trust: list[str]
     state: Path
-    """File of its tensors."""
     size: tuple[int, int]
-    """(height, width) of its images."""
     max_depth_m: float
     """Maximum depth [m]; the network predicts depth / max_depth_m."""
     parameters: int
@@ -42,15 +38,9 @@ class Subject:
 
 
 def make_subject(plan: Plan, folder: Path, *, runs: str) -> Subject:
-    """Build the network and write its tensors to ``folder``.
+    """Build the network and write its tensors to ``folder``; ``checkpoint=last`` searches the folder ``runs``.
 
-    Args:
-        plan: names the checkpoint or the model.
-        folder: existing.
-        runs: the folder of runs that ``checkpoint=last`` searches.
-
-    Raises:
-        HudepthError: if there is no such checkpoint, or the network cannot be built or does not accept the size.
+    Raises HudepthError if there is no such checkpoint, or the network cannot be built or does not accept the size.
     """
     trust = plan.trust or []
     if plan.checkpoint is not None:

@@ -19,13 +19,7 @@ MATRIX, PRODUCTS = 2048, 3
 
 
 class TorchRunner(Runner):
-    """A network in inference mode.
-
-    Args:
-        net: image [b, 3, h, w] to depth, in evaluation mode.
-        device: where it runs.
-        channels_last: the memory layout of images.
-    """
+    """A network, image [b, 3, h, w] to depth, in inference mode; ``channels_last`` is the layout of its images."""
 
     def __init__(self, net: nn.Module, *, device: torch.device, channels_last: bool) -> None:
         self.net, self.device, self.channels_last = net.to(device), device, channels_last
@@ -95,12 +89,7 @@ def product(spec: Spec) -> ProductRunner:
 
 
 def network(spec: Spec) -> TorchRunner:
-    """Run the network.
-
-    Args:
-        spec: as for :func:`build_net`, with the further options ``merged`` (as hudepth-predict and hudepth-test run
-            it), ``channels_last`` and ``compile``.
-    """
+    """Run the network; options ``merged`` (as hudepth-predict does), ``channels_last`` and ``compile``."""
     device, channels_last = _device(spec), bool(spec.options.get("channels_last"))
     net = build_merged(spec) if spec.options.get("merged") else build_net(spec)
     if spec.options.get("compile"):
@@ -112,11 +101,7 @@ def network(spec: Spec) -> TorchRunner:
 
 
 def build_net(spec: Spec) -> nn.Module:
-    """Build the network in evaluation mode.
-
-    Args:
-        spec: with the options ``model``, ``trust`` and ``state`` (file of its tensors).
-    """
+    """Build the network in evaluation mode; options are ``model``, ``trust`` and ``state`` (file of its tensors)."""
     torch.set_num_threads(spec.threads)
     net: nn.Module = instantiate(spec.options["model"], trust=spec.options["trust"])
     net.load_state_dict(torch.load(spec.options["state"], weights_only=True))

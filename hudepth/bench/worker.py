@@ -8,11 +8,11 @@ import os
 import signal
 import sys
 import time
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,21 +69,17 @@ class Runner:
         return peak_mb()
 
 
-@dataclass(frozen=True)
-class Begun:
-    """The first pass at a batch size."""
+class Begun(NamedTuple):
+    """The result of the first pass at a batch size, and its time, compiling and allocating included."""
 
     first_pass_s: float
-    """Compiling and allocating included."""
     result: NDArray[np.float32]
 
 
-class Worker:
-    """The parent's end of a process; use as a context manager.
+class Worker(AbstractContextManager["Worker"]):
+    """The parent's end of a process, which imports at once and then waits for commands; it prints to the file ``log``.
 
-    Args:
-        spec: what it runs. It starts importing at once; everything else waits for a command.
-        log: file for whatever its libraries print.
+    Every command raises ContenderError if it fails.
     """
 
     def __init__(self, spec: Spec, *, log: Path) -> None:
@@ -94,24 +90,16 @@ class Worker:
         self._process.start()
         theirs.close()  # so that the end of the process closes the pipe
 
-    def __enter__(self) -> Worker:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def build(self) -> dict[str, Any]:
-        """Build the runner; return its description.
-
-        Raises:
-            ContenderError: if it fails, as with all commands.
-        """
+        """Build the runner; return its description."""
         return dict(self._ask("build"))
 
     def begin(self, batch: int) -> Begun:
         """Switch to a batch size: two untimed passes; the peak memory restarts."""
-        begun: Begun = self._ask("begin", batch)
-        return begun
+        return Begun(*self._ask("begin", batch))
 
     def turn(self, seconds: float) -> list[float]:
         """Return the times [s] of passes: one untimed, then as many as fit into ``seconds``, at least one."""
@@ -183,10 +171,9 @@ def summarise_error(error: BaseException) -> str:
 def _silence(log: Path) -> None:
     """Redirect whatever is printed to a file, by libraries in other languages too."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-    for stream in (sys.stdout, sys.stderr):
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
         stream.flush()
-    os.dup2(descriptor, 1)
-    os.dup2(descriptor, 2)
+        os.dup2(descriptor, number)
     os.close(descriptor)
 
 
@@ -208,8 +195,7 @@ class _Server:
             raise self.failed
         self.runner: Runner = getattr(self.module, self.function)(self.spec)
         self.images = np.load(self.spec.images)
-        described: dict[str, Any] = self.runner.describe()
-        return described
+        return dict(self.runner.describe())
 
     def begin(self, batch: int) -> Begun:
         self.runner.reset_peak()
@@ -225,11 +211,8 @@ class _Server:
             times.append(self._time_pass())
         return times
 
-    def peak_mb(self) -> float:
-        return self.runner.peak_mb()
-
-    def matmul_gflop_per_s(self) -> float:
-        return float(self.runner.matmul_gflop_per_s())  # type: ignore[attr-defined]
+    def __getattr__(self, command: str) -> Any:
+        return getattr(self.__dict__.get("runner"), command)
 
     def _time_pass(self) -> float:
         start = time.perf_counter()

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from hudepth.bench.plot import draw_bench, save_bench
+from hudepth.bench.plot import draw_bench
+from hudepth.viz.panels import save_figure
 from tests.bench.test_rows import rows_of
 
 
@@ -14,5 +15,5 @@ def test_one_line_per_backend(tmp_path: Path) -> None:
     rows = [openvino, eager, replace(eager, batch=4, p25_ms=400, p75_ms=480), replace(eager, kind="peer")]
     (axis,) = draw_bench(rows, title="T").axes
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["eager", "openvino"]
-    save_bench(tmp_path / "bench.png", rows, title="T")
+    save_figure(tmp_path / "bench.png", draw_bench(rows, title="T"))
     assert Image.open(tmp_path / "bench.png").size[0] > 1000

@@ -16,15 +16,7 @@ SEVERITIES = ("warning", "note", "ok")
 def print_audit(
     name: str, n: int, splits: Mapping[str, AuditedSplit | str], configured: str, findings: Sequence[Finding]
 ) -> None:
-    """Print what each kind of split leaks, and the findings, the most severe first.
-
-    Args:
-        name: of the set.
-        n: its pairs.
-        splits: each kind of split, or why it is not possible.
-        configured: the kind of split in use.
-        findings: on the data.
-    """
+    """Print what each kind of split leaks, or why it is not possible, and the findings, the most severe first."""
     columns = ["", *(f"{kind} *" if kind == configured else kind for kind in splits)]
     table = Table(columns, title=f"{name}, {n:,} pairs: what a test split shares with training")
     cells = {kind: _cells(found) if isinstance(found, AuditedSplit) else {} for kind, found in splits.items()}

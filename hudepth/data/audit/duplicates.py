@@ -27,31 +27,23 @@ _BITS = np.array([number.bit_count() for number in range(1 << 16)], np.uint8)
 
 @dataclass(frozen=True)
 class Duplicates:
-    """Test images that are equal or nearly equal to training images."""
+    """Test images that are (nearly) equal to training images: their shares, ``near`` including ``exact``, and each."""
 
     exact: float
-    """Share of test images whose pixels equal those of a training image."""
     near: float
-    """Share of test images with a near duplicate in training, exact ones included."""
     nearest: NDArray[np.int64]
     """[n] position in the store of the training image most like each test image, in the order of the split."""
     bits: NDArray[np.int64]
     """[n] bits in which the hashes of the two differ, 0 to 64."""
     equal: NDArray[np.bool_]
-    """[n] whether the pixels of the two are equal."""
 
 
 def hash_images(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Hash images by the signs of their lowest frequencies (the pHash of Zauner, 2010).
+    """Hash RGB images [n, h, w, 3] to 64 bits [n] by the signs of their lowest frequencies (pHash; Zauner, 2010).
 
     A grey 32 x 32 thumbnail, averaged over areas, goes through a two-dimensional DCT. Each of its 8 x 8 lowest
-    frequencies gives one bit: whether it is above their median, which leaves out the constant term.
-
-    Args:
-        images: [n, h, w, 3] RGB.
-
-    Returns:
-        [n] 64-bit hashes. They ignore brightness and contrast; small changes flip a few bits.
+    frequencies gives one bit: whether it is above their median, which leaves out the constant term. Hashes ignore
+    brightness and contrast; small changes flip a few bits.
     """
     hashes = np.empty(len(images), np.uint64)
     for row, image in enumerate(images):
@@ -70,15 +62,9 @@ def digest_pixels(images: NDArray[np.uint8]) -> list[bytes]:
 def find_nearest_hashes(
     queries: NDArray[np.uint64], hashes: NDArray[np.uint64], *, block: int = 1 << 22
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find for each query the hash that differs in fewest bits, by comparing all pairs.
+    """Find for each query [n] the hash [m] that differs in fewest bits, by comparing all pairs, ``block`` at a time.
 
-    Args:
-        queries: [n].
-        hashes: [m], at least one.
-        block: pairs compared at a time, which bounds the memory (16 bytes per pair).
-
-    Returns:
-        [n] positions in ``hashes`` (the first of equals), and [n] differing bits, 0 to 64.
+    Returns positions [n] in ``hashes`` (the first of equals), and differing bits [n], 0 to 64.
     """
     position, bits = np.empty((2, len(queries)), np.int64)
     step = max(1, block // len(hashes))
@@ -92,13 +78,9 @@ def find_nearest_hashes(
 def find_duplicates(
     split: Split, hashes: NDArray[np.uint64], digests: Sequence[bytes], *, near_bits: int = NEAR_BITS
 ) -> Duplicates:
-    """Look for each test image among all training images of all scenes.
+    """Look for each test image among all training images, by the hashes [n] and digests of a store's images.
 
-    Args:
-        split: positions in a store.
-        hashes: [n] of all its images.
-        digests: of all its images, see :func:`digest_pixels`.
-        near_bits: hashes of near duplicates differ in at most this many bits.
+    Hashes of near duplicates differ in at most ``near_bits``.
     """
     train = np.asarray(split.train, np.int64)
     position, bits = find_nearest_hashes(hashes[split.test], hashes[train])

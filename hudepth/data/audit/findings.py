@@ -30,11 +30,9 @@ class Finding:
     severity: str
     """``ok``, ``note`` (be aware) or ``warning`` (act)."""
     found: str
-    """The figures, as text."""
+    """The figures as text; ``values`` has them as plain types."""
     meaning: str
-    """One sentence: what it means and what to do."""
     values: Mapping[str, Any]
-    """The figures, as plain types."""
 
 
 def judge_split(kind: str, leak: Leakage, copies: Duplicates | None) -> Finding:
@@ -43,15 +41,7 @@ def judge_split(kind: str, leak: Leakage, copies: Duplicates | None) -> Finding:
 
 
 def judge_depth(store: DepthStore, scan: Scan, raw: RawSample, *, indoor: bool, max_depth_m: float) -> list[Finding]:
-    """Judge the depth of a set: unit, step, holes, clipping, constant maps, sizes, skipped files.
-
-    Args:
-        store: the prepared set.
-        scan: of the store.
-        raw: of its source.
-        indoor: whether the set shows rooms.
-        max_depth_m: training clips depth to it.
-    """
+    """Judge the depth of a set: unit, step, holes, clipping, constant maps, sizes, skipped files."""
     verdicts = {
         "depth and unit": _unit(store.info, indoor=indoor),
         "step of depth": _step(raw),
@@ -77,12 +67,8 @@ def _leaks(leak: Leakage, copies: Duplicates | None) -> Verdict:
         meaning = "The test also rewards memory of known rooms: pass data.split=scene to test on new ones alone."
         return "warning", found, meaning, values
     if copies and copies.near > 0:
-        return (
-            "note",
-            found,
-            "Scene names differ, but some test images look like training images: see leaks.png.",
-            values,
-        )
+        meaning = "Scene names differ, but some test images look like training images: see leaks.png."
+        return "note", found, meaning, values
     return "ok", found, "No scene is both trained on and tested on.", values
 
 
@@ -156,12 +142,7 @@ def _sizes(sizes: Sequence[Sequence[int]]) -> Verdict:
     values = {"sizes": [list(size) for size in sizes]}
     if len(sizes) == 1:
         return "ok", found, "All images have one size.", values
-    return (
-        "note",
-        found,
-        "If shapes differ too, resizing distorts them unequally: crop the images first.",
-        values,
-    )
+    return "note", found, "If shapes differ too, resizing distorts them unequally: crop the images first.", values
 
 
 def _repeated(digests: Sequence[bytes]) -> Verdict:

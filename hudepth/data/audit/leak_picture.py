@@ -15,24 +15,17 @@ COLOURS = {"near": "tab:red", "scene": "tab:orange", "other": "0.35"}
 
 @dataclass(frozen=True)
 class LeakRow:
-    """A test image and the training image most like it."""
+    """A test image and the training image most like it; the grade, a key of ``COLOURS``, colours the verdict."""
 
     images: NDArray[np.uint8]
     """[2, h, w, 3] RGB, the test image first."""
     names: Sequence[str]
     verdict: str
-    """How similar the two are: a few short lines."""
     grade: str
-    """``near`` (duplicates), ``scene`` (the same) or ``other``: the verdict's colour."""
 
 
 def draw_leaks(rows: Sequence[LeakRow], *, title: str) -> Figure:
-    """Draw the test image, the training image and the verdict of each row.
-
-    Args:
-        rows: at least one.
-        title: above the rows; lines are not broken.
-    """
+    """Draw the test image, the training image and the verdict of each row, at least one, below the title."""
     cell, gap, text, label = 2.2, 0.1, 2.0, 0.22  # inches: gaps and letters keep their size at any number of rows
     top, bottom = 0.35 + 0.16 * title.count("\n"), 0.08
     cell_height = cell * rows[0].images.shape[1] / rows[0].images.shape[2]

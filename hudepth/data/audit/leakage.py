@@ -21,10 +21,7 @@ UNKNOWN = -1
 
 @dataclass(frozen=True)
 class Leakage:
-    """How much of the test frames' scenes training sees.
-
-    Shares are of the test frames whose scene has a name, NaN if there are none.
-    """
+    """How much of the test frames' scenes training sees; shares are NaN if no test frame's scene has a name."""
 
     counts: dict[str, int]
     """Pairs in train, val and test."""
@@ -40,24 +37,21 @@ class Leakage:
 
 @dataclass(frozen=True)
 class AuditedSplit:
-    """A split and what it leaks."""
+    """A split and what it leaks; ``copies`` is None if the images were not read."""
 
     split: Split
     leak: Leakage
     copies: Duplicates | None
-    """None if the images were not read."""
 
 
 @dataclass(frozen=True)
 class Leak:
-    """A test image and the training image that gives it away, by position in the store."""
+    """A test image and the training image that gives it away, by position; ``equal`` in pixels, ``near`` duplicates."""
 
     test: int
     train: int
     equal: bool
-    """Whether their pixels are equal."""
     near: bool
-    """Whether they are near duplicates."""
     bits: int
     """Bits in which their hashes differ."""
     frames_apart: int | None
@@ -65,11 +59,7 @@ class Leak:
 
 
 class SceneOrder:
-    """The place of each frame in its scene.
-
-    Args:
-        records: all pairs, in any order. Frames of a scene are sorted by number; equal numbers keep their order.
-    """
+    """The place of each frame in its scene; frames are sorted by number, and equal numbers keep their order."""
 
     def __init__(self, records: Sequence[Record]) -> None:
         numbers: dict[str, int] = {}
@@ -127,18 +117,11 @@ def measure_leakage(records: Sequence[Record], split: Split) -> Leakage:
 def find_worst_leaks(
     records: Sequence[Record], split: Split, copies: Duplicates, hashes: NDArray[np.uint64], *, rows: int = 6
 ) -> list[Leak]:
-    """Choose the test images that training gives away most, each with one training image.
+    """Choose the ``rows`` test images that training gives away most, each with one training image.
 
     That is the near duplicate if there is one, else the most similar training image of the same scene, else the most
     similar of all. They come in this order, then by hash, then by distance; a scene comes a second time only after
-    all others have come once.
-
-    Args:
-        records: of the store.
-        split: positions in the store.
-        copies: duplicates of this split.
-        hashes: [n] of all images of the store.
-        rows: how many to choose.
+    all others have come once. ``hashes`` [n] are those of all images of the store.
     """
     order = SceneOrder(records)
     train = np.asarray(split.train, np.int64)

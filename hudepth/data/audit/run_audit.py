@@ -50,12 +50,7 @@ class AuditOptions:
 def audit(config: Mapping[str, Any], datamodule: DepthDataModule) -> None:
     """Print what each kind of split leaks and what is odd about the data; write audit.json and leaks.png.
 
-    Args:
-        config: the configuration, see :class:`AuditOptions`.
-        datamodule: the set, with the split to judge.
-
-    Raises:
-        HudepthError: with one line for the user.
+    Raises HudepthError with one line for the user.
     """
     options = parse(AuditOptions, config)
     source, kind = datamodule.source, datamodule.split_kind

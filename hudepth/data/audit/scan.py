@@ -24,7 +24,6 @@ class Scan:
     """What one pass over a store collects."""
 
     hashes: NDArray[np.uint64]
-    """[n] perceptual hash of each image."""
     digests: list[bytes]
     """[n] equal for images of equal pixels."""
     histogram: NDArray[np.int64]
@@ -66,10 +65,7 @@ def scan_store(store: DepthStore) -> Scan:
 def sample_raw(source: Source, records: Sequence[Record], *, pairs: int = 16) -> RawSample:
     """Read some pairs, evenly spaced, to see how finely depth is stored. Pairs that cannot be read are left out.
 
-    Args:
-        source: where the pairs come from.
-        records: of the source, not of a store, which does not record where files are.
-        pairs: how many to read.
+    ``records`` are the source's and not a store's, which does not record where files are.
     """
     steps_mm, levels, total = [], 0, 0
     tops: list[tuple[str, float, int]] = []  # type, largest value, pixels at it

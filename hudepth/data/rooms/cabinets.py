@@ -18,9 +18,8 @@ def _doors(width: float, y: Span, front: float, *, columns: int, rows: int = 1) 
         left, low = -width / 2 + c * w, y[0] + r * h
         panel_x, panel_y = (left + 0.006, left + w - 0.006), (low + 0.006, low + h - 0.006)
         parts.append(Part("panel", panel_x, panel_y, (front, front + 0.02)))
-        drawer = rows > 1
-        handle_x = left + w / 2 if drawer else left + w * (0.9 - 0.8 * (c % 2))
-        handle_y = low + h * 0.8 if drawer else low + h / 2
+        drawer = (left + w / 2, low + h * 0.8)
+        handle_x, handle_y = drawer if rows > 1 else (left + w * (0.9 - 0.8 * (c % 2)), low + h / 2)
         parts.append(Part("metal", around(handle_x, 0.05), around(handle_y, 0.01), (front + 0.02, front + 0.04)))
     return parts
 
@@ -99,22 +98,19 @@ def counter(rng: Rng) -> Piece:
     w, d = rng.uniform(1.6, 2.8), 0.62
     n = round(w / 0.55)
     oven = w / 2 - w / n
-    return Piece(
-        w,
-        d,
-        [
-            Part("dark", around(0, w / 2), (0, 0.1), (0, d - 0.1)),
-            Part("panel", around(0, w / 2), (0.1, 0.87), (0, d - 0.05)),
-            Part("worktop", around(0, w / 2 + 0.01), (0.87, 0.91), (0, d)),
-            Part("tiles", around(0, w / 2), (0.91, 1.45), (0, 0.008)),
-            Part("panel", around(0, w / 2), (1.45, 2.1), (0, 0.33)),
-            *_doors(w, (0.11, 0.86), d - 0.05, columns=n),
-            *_doors(w, (1.46, 2.09), 0.33, columns=n),
-            *clutter(rng, around(0, w / 2 - 0.1), (0.06, d - 0.2), 0.91, most=6),
-            Part("dark", (oven + 0.04, w / 2 - 0.04), (0.25, 0.72), (d - 0.03, d - 0.02)),
-            Part("dark", (oven + 0.02, w / 2 - 0.02), (0.91, 0.918), (0.08, d - 0.08)),
-        ],
-    )
+    parts = [
+        Part("dark", around(0, w / 2), (0, 0.1), (0, d - 0.1)),
+        Part("panel", around(0, w / 2), (0.1, 0.87), (0, d - 0.05)),
+        Part("worktop", around(0, w / 2 + 0.01), (0.87, 0.91), (0, d)),
+        Part("tiles", around(0, w / 2), (0.91, 1.45), (0, 0.008)),
+        Part("panel", around(0, w / 2), (1.45, 2.1), (0, 0.33)),
+        *_doors(w, (0.11, 0.86), d - 0.05, columns=n),
+        *_doors(w, (1.46, 2.09), 0.33, columns=n),
+        *clutter(rng, around(0, w / 2 - 0.1), (0.06, d - 0.2), 0.91, most=6),
+        Part("dark", (oven + 0.04, w / 2 - 0.04), (0.25, 0.72), (d - 0.03, d - 0.02)),
+        Part("dark", (oven + 0.02, w / 2 - 0.02), (0.91, 0.918), (0.08, d - 0.08)),
+    ]
+    return Piece(w, d, parts)
 
 
 def fridge(rng: Rng) -> Piece:

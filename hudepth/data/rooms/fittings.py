@@ -5,22 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
+from hudepth.data.rooms import furniture
 from hudepth.data.rooms.cabinets import cabinet, counter, fridge, nightstand, shelf, television, wardrobe
-from hudepth.data.rooms.furniture import (
-    Part,
-    Piece,
-    Rng,
-    around,
-    bed,
-    carton,
-    chair,
-    coffee_table,
-    desk,
-    dining_set,
-    office_chair,
-    sofa,
-    table,
-)  # fmt: skip
+from hudepth.data.rooms.furniture import Part, Piece, Rng, around, carton, chair, desk, dining_set, sofa
 from hudepth.data.rooms.raycast import CYLINDER, ELLIPSOID
 
 
@@ -72,9 +59,8 @@ def window(rng: Rng) -> Piece:
     ]
     if rng.random() < 0.6:
         inner, outer = w / 2 - 0.08, w / 2 + 0.22
-        parts += [
-            Part("curtain", x, (low - 0.14, high + 0.15), (0.05, 0.12)) for x in ((-outer, -inner), (inner, outer))
-        ]
+        y, z = (low - 0.14, high + 0.15), (0.05, 0.12)
+        parts += [Part("curtain", x, y, z) for x in ((-outer, -inner), (inner, outer))]
     return Piece(w + 0.5, 0.13, parts)
 
 
@@ -82,12 +68,9 @@ def picture(rng: Rng) -> Piece:
     """A framed picture."""
     w, h, y = rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.7), rng.uniform(1.45, 1.65)
     frame, motif = str(rng.choice(["wood", "dark", "white"])), str(rng.choice(["painting", "poster"]))
-    inner_y = (y - h / 2 + 0.04, y + h / 2 - 0.04)
-    parts = [
-        Part(frame, around(0, w / 2), around(y, h / 2), (0, 0.025)),
-        Part(motif, around(0, w / 2 - 0.04), inner_y, (0.025, 0.027)),
-    ]
-    return Piece(w, 0.03, parts)
+    border = Part(frame, around(0, w / 2), around(y, h / 2), (0, 0.025))
+    inside = Part(motif, around(0, w / 2 - 0.04), (y - h / 2 + 0.04, y + h / 2 - 0.04), (0.025, 0.027))
+    return Piece(w, 0.03, [border, inside])
 
 
 def ceiling_lamp(height_m: float) -> Piece:
@@ -107,7 +90,7 @@ def skirting(length_m: float) -> Piece:
 
 Maker: TypeAlias = Callable[[Rng], Piece]
 WALL: dict[str, list[Maker]] = {
-    "bedroom": [bed, nightstand, wardrobe, desk, cabinet, shelf, plant, floor_lamp, television],
+    "bedroom": [furniture.bed, nightstand, wardrobe, desk, cabinet, shelf, plant, floor_lamp, television],
     "kitchen": [counter, fridge, counter, cabinet, shelf, carton, plant],
     "office": [desk, shelf, desk, cabinet, shelf, plant, wardrobe, floor_lamp],
     "living_room": [sofa, television, shelf, cabinet, floor_lamp, plant, sofa, desk],
@@ -116,8 +99,8 @@ WALL: dict[str, list[Maker]] = {
 FREE: dict[str, list[Maker]] = {
     "bedroom": [carton, chair],
     "kitchen": [dining_set, chair],
-    "office": [table, office_chair, carton],
-    "living_room": [coffee_table, dining_set, chair, carton],
+    "office": [furniture.table, furniture.office_chair, carton],
+    "living_room": [furniture.coffee_table, dining_set, chair, carton],
 }
 """Pieces that stand in the middle of the room."""
 CATEGORIES = tuple(WALL)

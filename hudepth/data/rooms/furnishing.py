@@ -37,7 +37,7 @@ depths spread as in NYU Depth V2."""
 
 
 class FurnishedRoom:
-    """The parts of one room, in world coordinates, and the space each piece takes."""
+    """The parts of one room of ``size`` [3] in metres, in world coordinates, and the space each piece takes."""
 
     def __init__(self, rng: Rng, category: str, habits: Habits) -> None:
         self.rng = rng
@@ -46,7 +46,6 @@ class FurnishedRoom:
         short = rng.uniform(min(3.0, long), min(5.0, np.sqrt(96 - long**2)))  # keeps every depth below 10 m
         x, z = (long, short) if rng.random() < 0.5 else (short, long)
         self.size = np.array([x, rng.uniform(2.4, 2.9), z])
-        """[3] metres."""
         self.low, self.high = np.empty((0, 3)), np.empty((0, 3))
         self.placed: list[tuple[Part, float, float, float]] = []
         self._furnish(category, habits.covered_floor)
@@ -94,8 +93,7 @@ class FurnishedRoom:
     def _at_wall(self, wall: int, along: float) -> tuple[float, float, float]:
         """Return x, z, yaw with the back to wall 0..3 (z = 0, z = end, x = 0, x = end); ``along`` in 0..1."""
         x, _, z = (float(extent) for extent in self.size)
-        turn = np.pi / 2
-        return [(along * x, 0, 0), (along * x, z, np.pi), (0, along * z, turn), (x, along * z, -turn)][wall]
+        return [(along * x, 0, 0), (along * x, z, np.pi), (0, along * z, np.pi / 2), (x, along * z, -np.pi / 2)][wall]
 
     def _put_at_wall(self, piece: Piece) -> None:
         """Place a piece with its back to any wall, if one of 12 tries fits."""
@@ -116,16 +114,12 @@ class FurnishedRoom:
         return float(area[self.low[:, 1] < 0.2].sum() / self.size[[0, 2]].prod())
 
     def clearance(self, places: F64) -> F64:
-        """Return a lower bound [n] of the distance from places x, z [n, 2] to the nearest wall or piece [m].
-
-        It is negative inside a piece.
-        """
+        """Return a lower bound [n] of the distance from x, z [n, 2] to walls and pieces [m], negative inside one."""
         plan = [0, 2]
         walls = np.minimum(places, self.size[plan] - places).min(1)
         at = places[:, None]
         pieces = np.maximum(self.low[:, plan] - at, at - self.high[:, plan]).max(2).min(1, initial=np.inf)
-        gaps: F64 = np.minimum(walls, pieces)
-        return gaps
+        return np.asarray(np.minimum(walls, pieces))
 
     def solids(self) -> Solids:
         """Return all parts in world coordinates."""

@@ -47,10 +47,8 @@ def clutter(rng: Rng, x: Span, z: Span, y: float, *, most: int = 4) -> list[Part
         half = min(rng.uniform(0.04, 0.14), (right - left) / 2.2)
         back = rng.uniform(z[0], max(z[0], z[1] - 2 * half))
         kind = CYLINDER if rng.random() < 0.4 else BOX
-        if kind == CYLINDER:
-            half, height = min(half, 0.05), rng.uniform(0.1, 0.28)
-        else:
-            height = rng.uniform(0.03, 0.14)
+        height = rng.uniform(0.1, 0.28) if kind == CYLINDER else rng.uniform(0.03, 0.14)
+        half = min(half, 0.05) if kind == CYLINDER else half
         material = str(rng.choice(ACCENTS))
         parts.append(Part(material, around((left + right) / 2, half), (y, y + height), (back, back + 2 * half), kind))
     return parts

@@ -18,7 +18,7 @@ _TABLE = 512
 
 
 class Material(NamedTuple):
-    """A procedural texture: ``pattern`` picks between two linear RGB colours at every point of a face."""
+    """A texture that picks between two linear RGB colours at every point of a face."""
 
     pattern: str
     """A key of ``PATTERNS``; ``glow`` shines by itself, whatever light falls on it."""
@@ -35,15 +35,13 @@ def _noise_table() -> F32:
     f = np.hypot(np.fft.fftfreq(_TABLE)[:, None], np.fft.fftfreq(_TABLE)[None]) * _TABLE
     spectrum = np.fft.fft2(rng.standard_normal((_TABLE, _TABLE))) / np.maximum(f, 2.0) ** 1.3
     noise = np.fft.ifft2(spectrum).real
-    table: F32 = np.clip(0.5 + 0.2 * (noise - noise.mean()) / noise.std(), 0, 1).astype(np.float32)
-    return table
+    return np.asarray(np.clip(0.5 + 0.2 * (noise - noise.mean()) / noise.std(), 0, 1), np.float32)
 
 
 def noise(u: F32, v: F32) -> F32:
     """Look up fractal noise [0, 1] at any points; it repeats every 512 units."""
     column, row = u.astype(np.int32) & (_TABLE - 1), v.astype(np.int32) & (_TABLE - 1)
-    values: F32 = _noise_table()[row, column]
-    return values
+    return np.asarray(_noise_table()[row, column])
 
 
 def _fibres(u: F32, v: F32) -> F32:
@@ -65,16 +63,14 @@ def _wood(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     plank: F32 = np.floor(across)
     grain = _fibres(across * 60 + plank * 97, v * 22 + plank * 31)
     seam = ((across - plank) < 0.04) * sharp
-    weight: F32 = 0.65 * grain + 0.35 * _hash(plank.astype(np.int32)) + 0.6 * seam
-    return weight
+    return np.asarray(0.65 * grain + 0.35 * _hash(plank.astype(np.int32)) + 0.6 * seam)
 
 
 def _tiles(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     a, b = u / scale, v / scale
     i, j = np.floor(a), np.floor(b)
     grout = np.maximum((a - i) < 0.035, (b - j) < 0.035) * sharp
-    weight: F32 = 0.12 * _hash((i * 71 + j).astype(np.int32)) + 0.25 * noise(u * 90, v * 90) + 0.8 * grout
-    return weight
+    return np.asarray(0.12 * _hash((i * 71 + j).astype(np.int32)) + 0.25 * noise(u * 90, v * 90) + 0.8 * grout)
 
 
 def _stripes(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
@@ -85,14 +81,12 @@ def _stripes(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
 def _books(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     book = np.floor(u / scale + 0.6 * np.sin(u / scale)).astype(np.int32)
     colour: F32 = np.stack([_hash(book * 3 + c) for c in (0, 1, 2)])
-    weight: F32 = (0.6 * colour + 0.4 * _hash(book * 5 + 1)) ** 2 * (0.8 + 0.4 * noise(u * 40, v * 300))
-    return weight
+    return np.asarray((0.6 * colour + 0.4 * _hash(book * 5 + 1)) ** 2 * (0.8 + 0.4 * noise(u * 40, v * 300)))
 
 
 def _view(u: F32, v: F32, scale: F32, sharp: F32) -> F32:
     """Large soft shapes, brighter above: a painting, or what a screen shows."""
-    shapes: F32 = np.clip(3 * noise(u * 90 + 40, v * 90 + 90) - 1 + 0.8 * v / scale, 0, 1)
-    return shapes
+    return np.asarray(np.clip(3 * noise(u * 90 + 40, v * 90 + 90) - 1 + 0.8 * v / scale, 0, 1))
 
 
 def _mottled(cells_per_m: float, strength: float, u: F32, v: F32, scale: F32, sharp: F32) -> F32:
@@ -116,11 +110,8 @@ PATTERNS: dict[str, Callable[[F32, F32, F32, F32], F32]] = {
 def pattern_weight(material: Material, u: F32, v: F32, footprint: F32) -> F32:
     """Return how much of the second colour each point gets: [n], or [3, n] if every channel has its own.
 
-    Args:
-        material: its pattern and scale are used.
-        u: [n] metres along the face.
-        v: [n] metres along the face, upwards on vertical faces.
-        footprint: [n] size of a pixel on the face [m]; seams and stripes finer than that fade out.
+    ``u`` and ``v`` [n] are metres along the face, ``v`` upwards on vertical faces. Seams and stripes finer than
+    ``footprint`` [n], the size of a pixel on the face [m], fade out.
     """
     scale = np.array(material.scale_m, np.float32)
     return PATTERNS[material.pattern](u, v, scale, np.clip(scale / (4 * footprint + 1e-6), 0, 1))

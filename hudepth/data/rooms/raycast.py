@@ -28,27 +28,22 @@ _NEVER_ZERO = 1e-20
 
 
 class View(NamedTuple):
-    """A bundle of rays, one for each pair of ``xs`` and ``ys``."""
+    """Rays from ``origin`` [3] in metres, one for each pair of ``xs`` [w] and ``ys`` [h], ascending slopes."""
 
     origin: F64
-    """[3] metres."""
     axes: F64
     """[3, 3], rows right, down, forward; orthonormal."""
     xs: F32
-    """[w] slopes to the right, ascending."""
     ys: F32
-    """[h] slopes downwards, ascending."""
 
 
 class Solids(NamedTuple):
-    """Solids as arrays; each is a unit shape scaled by ``half``, turned by ``yaw``, moved to ``centre``."""
+    """Unit shapes scaled by ``half`` [n, 3], turned by ``yaw`` and moved to ``centre`` [n, 3], in metres."""
 
     kind: NDArray[np.int8]
     """[n] BOX, ELLIPSOID or CYLINDER (upright)."""
     centre: F64
-    """[n, 3] metres."""
     half: F64
-    """[n, 3] half extents, metres."""
     yaw: F64
     """[n] radians about y; the solid's own z axis points to (sin yaw, 0, cos yaw)."""
 
@@ -71,16 +66,10 @@ def pinhole_view(origin: F64, axes: F64, *, height: int, width: int) -> View:
 
 
 def trace(view: View, room_size: F64, solids: Solids) -> tuple[F32, NDArray[np.int16]]:
-    """Find the first surface each ray meets.
+    """Find the first surface each ray meets in a room of ``room_size`` [3] in metres.
 
-    Args:
-        view: the rays; the origin lies in the room and outside every solid.
-        room_size: [3] metres.
-        solids: what stands in the room.
-
-    Returns:
-        depth [h, w] along the optical axis [m], and the surface [h, w]: a room face below ``ROOM_FACES``,
-        else ``ROOM_FACES`` + the number of the solid.
+    The rays start in the room and outside every solid. Returns depth [h, w] along the optical axis [m], and the
+    surface [h, w]: a room face below ``ROOM_FACES``, else ``ROOM_FACES`` + the number of the solid.
     """
     depth, surface = _trace_room(view, room_size)
     starts, components = _local_rays(view, solids)
@@ -116,11 +105,7 @@ def _directions(component: F64, xs: F32, ys: F32) -> F32:
 
 
 def _local_rays(view: View, solids: Solids) -> tuple[F64, F64]:
-    """Turn and scale the camera into the frame in which each solid has half extent 1.
-
-    Returns:
-        The origin [n, 3], and the components [n, 3, 3] of right, down, forward (last) along each local axis.
-    """
+    """Return origin [n, 3], and right, down, forward (last) [n, 3, 3], in frames where solids have half extent 1."""
     cos, sin, zero = np.cos(solids.yaw), np.sin(solids.yaw), np.zeros(len(solids.yaw))
     turn = np.array([[cos, zero, -sin], [zero, zero + 1, zero], [sin, zero, cos]]).transpose(2, 0, 1)
     to_local = turn / solids.half[:, :, None]
@@ -184,6 +169,4 @@ def _inside_quadric(start: F64, directions: list[Float]) -> tuple[Float, Float]:
     b = sum(s * d for s, d in zip(start, directions, strict=True))
     root = b * b - a * (start @ start - 1)
     reach = np.sqrt(np.maximum(root, 0)) / a
-    near, far = -b / a - reach, -b / a + reach
-    near[root < 0] = np.inf
-    return near, far
+    return np.where(root < 0, np.inf, -b / a - reach), -b / a + reach

@@ -18,12 +18,10 @@ _WALL_CLEARANCE_M = 0.35
 
 
 class CameraPath(NamedTuple):
-    """A camera that sways around one place and looks about: any frame follows from its number alone."""
+    """A camera that sways around ``centre`` by ``sway`` [3] in metres: any frame follows from its number alone."""
 
     centre: F64
-    """[3] metres."""
     sway: F64
-    """[3] metres along x, y, z."""
     phase: F64
     """[6] radians, for x, y, z, yaw, pitch and roll."""
     yaw: float
@@ -53,20 +51,12 @@ def build_room(seed: int, scene: int, variety: str = "usual") -> Room:
     room = FurnishedRoom(rng, category, VARIETIES[variety])
     materials = room_materials(rng, category)
     faces = ["wall", "wall", "floor", "ceiling", "accent_wall", "wall"]
-    number = {name: i for i, name in enumerate(materials)}
     names = faces + [part.material for part, *_ in room.placed]
+    number = np.array([list(materials).index(name) for name in names], np.int16)
     solids = room.solids()
     main, fill, ambient = _lights(rng, room.size)
-    furnished = Scene(
-        room_size=room.size,
-        solids=solids,
-        materials=list(materials.values()),
-        surface_material=np.array([number[name] for name in names], np.int16),
-        ceiling_light=main,
-        fill_light=fill,
-        ambient=ambient,
-        shadow=shadow_map(room.size, solids, main.position),
-    )
+    shadow = shadow_map(room.size, solids, main.position)
+    furnished = Scene(room.size, solids, list(materials.values()), number, main, fill, ambient, shadow)
     return Room(furnished, _choose_path(rng, room, solids, VARIETIES[variety]))
 
 
@@ -100,12 +90,7 @@ def _choose_path(rng: Rng, room: FurnishedRoom, solids: Solids, habits: Habits) 
         x, z = places[i]
         away = np.arctan2(size[0] / 2 - x, size[2] / 2 - z) + rng.normal(0, 0.4)
         sway = min(max(gaps[i] - 0.25, 0.0), 0.5) / np.sqrt(2)
-        path = CameraPath(
-            centre=np.array([x, rng.uniform(*habits.height_m), z]),
-            sway=np.array([sway, 0.08, sway]),
-            phase=rng.uniform(0, 2 * np.pi, 6),
-            yaw=float(away),
-            pitch=float(rng.uniform(*habits.pitch)),
-        )
-        candidates.append(path)
+        centre, phase = np.array([x, rng.uniform(*habits.height_m), z]), rng.uniform(0, 2 * np.pi, 6)
+        pitch = float(rng.uniform(*habits.pitch))
+        candidates.append(CameraPath(centre, np.array([sway, 0.08, sway]), phase, float(away), pitch))
     return max(candidates, key=lambda path: min(score(path, 0), score(path, 4)))

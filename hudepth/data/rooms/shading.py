@@ -17,19 +17,16 @@ _SHADOW_CELLS = 224
 
 
 class Light(NamedTuple):
-    """A lamp with distance falloff."""
+    """A lamp at ``position`` [3] in metres; ``colour`` [3] is linear RGB, the irradiance at one metre."""
 
     position: F64
-    """[3] metres."""
     colour: F64
-    """[3] linear RGB, the irradiance at one metre."""
 
 
 class Scene(NamedTuple):
-    """All that is needed to render a room from any place in it."""
+    """All that is needed to render a room of ``room_size`` [3] in metres from any place in it."""
 
     room_size: F64
-    """[3] metres."""
     solids: Solids
     materials: list[Material]
     surface_material: NDArray[np.int16]
@@ -54,12 +51,10 @@ def shadow_map(room_size: F64, solids: Solids, light_position: F64) -> F32:
 
 
 class _Hits(NamedTuple):
-    """What the rays of a view hit, flattened: n = h * w."""
+    """Points [3, n] of h * w rays in world coordinates [m], with normals [3, n] and coordinates on their face."""
 
     point: F32
-    """[3, n] world coordinates, metres."""
     normal: F32
-    """[3, n] world, towards the viewer's side of the surface."""
     u: F32
     v: F32
     surface: NDArray[np.int16]
@@ -148,8 +143,7 @@ def _irradiance(light: Light, hits: _Hits) -> F32:
     towards = light.position.astype(np.float32)[:, None] - hits.point
     squared = np.einsum("kn,kn->n", towards, towards)
     cosine = np.einsum("kn,kn->n", towards, hits.normal) / np.sqrt(squared)
-    irradiance: F32 = np.maximum(cosine, 0) / (0.8 + squared)
-    return irradiance
+    return np.asarray(np.maximum(cosine, 0) / (0.8 + squared))
 
 
 def _corner_shade(scene: Scene, hits: _Hits) -> F32:
@@ -162,15 +156,9 @@ def _corner_shade(scene: Scene, hits: _Hits) -> F32:
 
 
 def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[np.uint8], F32]:
-    """Render a scene.
+    """Render image [h, w, 3] RGB and depth [h, w] along the optical axis [m].
 
-    Args:
-        scene: the room.
-        view: the camera's rays.
-        rng: draws exposure, white balance and sensor noise; geometry does not depend on it.
-
-    Returns:
-        image [h, w, 3] RGB, and depth [h, w] along the optical axis [m].
+    Exposure, white balance and sensor noise are drawn from ``rng``; the geometry does not depend on it.
     """
     depth, surface = trace(view, scene.room_size, scene.solids)
     hits = _find_hits(scene, view, depth, surface)
@@ -180,13 +168,13 @@ def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[
     pixel = np.float32(1 / Intrinsics.of_nyu(height, width).fx)
     albedo, glow = _albedo(scene, hits, flat * flat * pixel / np.maximum(facing, 1e-2))
 
-    corner = _corner_shade(scene, hits)
-    sky = corner * (0.82 + 0.12 * hits.normal[1] + 0.08 * hits.normal[0])
+    sky = _corner_shade(scene, hits) * (0.82 + 0.12 * hits.normal[1] + 0.08 * hits.normal[0])
     ceiling = _irradiance(scene.ceiling_light, hits) * _lit_fraction(scene, hits.point, hits.normal[1])
     fill = _irradiance(scene.fill_light, hits)
     sources = ((scene.ambient, sky), (scene.ceiling_light.colour, ceiling), (scene.fill_light.colour, fill))
-    dark = np.zeros((3, flat.size), np.float32)
-    light = sum((colour.astype(np.float32)[:, None] * amount for colour, amount in sources), dark)
+    light = np.zeros((3, flat.size), np.float32)
+    for colour, amount in sources:
+        light += colour.astype(np.float32)[:, None] * amount
     light[:, glow] = 1
     return _expose((albedo * light).reshape(3, height, width), view, rng), depth
 
@@ -195,8 +183,7 @@ def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[
 def _tone_curve() -> F32:
     """4096 steps of linear light in [0, 2) to 8-bit values, with a soft shoulder instead of a hard clip."""
     linear = np.arange(4096) / 2048
-    curve: F32 = (255 * np.sqrt((1 - np.exp(-1.9 * linear)) / (1 - np.exp(-3.8)))).astype(np.float32)
-    return curve
+    return np.asarray(255 * np.sqrt((1 - np.exp(-1.9 * linear)) / (1 - np.exp(-3.8))), np.float32)
 
 
 def _expose(linear: F32, view: View, rng: np.random.Generator) -> NDArray[np.uint8]:
