@@ -1,12 +1,10 @@
 """Means over seeds, differences between rows, and the uncertainty of both.
 
-There are two sources of uncertainty, with an interval each:
-
     seeds    another seed gives another network: Student's t over the seeds' values, or over their paired differences
     scenes   another test set has other scenes: bootstrap of the mean over the seeds, every seed with the same draws
 
-A difference is shown only if every interval there is excludes 0. These are 95 % intervals of one metric and one row
-each: among many rows some differ by chance.
+A difference is shown only if every interval there is excludes 0: 95 % intervals of one metric and row each, so that
+among many rows some differ by chance.
 """
 
 from __future__ import annotations

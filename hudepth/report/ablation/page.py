@@ -49,10 +49,7 @@ def page(
     notes: Sequence[str] = (),
     facts: Mapping[str, str] | None = None,
 ) -> str:
-    """Return report.html.
-
-    Pictures become part of the page; ``notes`` list what was skipped, ``facts`` join those at the top of the page.
-    """
+    """Return report.html, pictures in it; ``notes`` list what was skipped, ``facts`` join those at the top."""
     troubles = [(each.run or "-", each.row, each.seed, each.state, each.why or "-") for each in report.troubles]
     columns = ("run", "row", "seed", "state", "why")
     parts = [
@@ -174,7 +171,8 @@ def _difference(row: Row, name: str, digits: int) -> Html:
     found = row.contrasts.get(name)
     if found is None or found.value != found.value:
         return tag("td", "–", data_value="")
-    is_shown, alone = found.verdict != NOT_SHOWN, words.rests_on(found)
+    is_shown = found.verdict != NOT_SHOWN  # then at least one interval is known
+    alone = "" if found.seeds.known and found.scenes.known else f"{'scenes' if found.scenes.known else 'seeds'} alone"
     arrow = (" ▲" if found.value > 0 else " ▼") if is_shown else ""
     value = tag("span", f"{words.number(found.value, digits, sign=True)}{arrow}", class_="value")
     word = tag("small", f"{found.verdict}, {alone}" if alone and is_shown else found.verdict, class_="word")

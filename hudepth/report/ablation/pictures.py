@@ -38,7 +38,7 @@ Drawn = tuple[Figure, str, str] | None  # figure, title and caption; None if the
 
 
 def draw_pictures(report: Report, folder: Path, *, config: Mapping[str, Any]) -> list[Picture]:
-    """Draw what there is to show into ``folder``; a picture of an earlier report that is not drawn again is removed.
+    """Draw what there is to show into ``folder``; remove what an earlier report drew and this one does not.
 
     ``config`` holds ``panels`` (how many images, 0: none), and ``paths``, ``data`` and ``trust`` to open runs with.
     """

@@ -17,16 +17,14 @@ from hudepth.viz.style import COLOURS, shorten, strip_frame
 
 STYLES = ("-", "--")
 OTHER = "0.8"
-
 History = Sequence[Mapping[str, float]]
 Band = tuple[Floats, Floats, Floats, Floats]  # epochs, mean over the seeds, lowest, highest
 
 
 def draw_variants(histories: Mapping[str, Sequence[History]], *, shown: Sequence[str], monitor: str = "") -> Figure:
-    """Draw one plot per validation metric, in it one line per row; ``histories`` holds metrics.csv by row and seed.
+    """Draw a plot per headline metric, or of ``monitor``; in it a line per row, from its metrics.csv of each seed.
 
-    Rows in ``shown`` get a colour and a name, the most important first; the others are grey. ``monitor`` is drawn if
-    there is no headline metric.
+    Rows in ``shown`` get a colour and a name, the most important first; the others are grey.
     """
     known = {key for runs in histories.values() for run in runs for row in run for key in row}
     keys = [f"val/{name}" for name in metric_names("headline") if f"val/{name}" in known]

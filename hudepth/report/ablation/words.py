@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from hudepth.metrics.catalogue import metric_info
-from hudepth.report.ablation.estimates import Contrast, Interval
+from hudepth.report.ablation.estimates import Interval
 from hudepth.report.ablation.report import Report
 
 MOST_PLACES = 7
@@ -39,13 +39,6 @@ def half_width(interval: Interval, digits: int) -> str:
 def heading(name: str) -> str:
     """Return a metric's name, its unit, and which way is better."""
     return f"{metric_info(name).label} {metric_info(name).arrow}"
-
-
-def rests_on(contrast: Contrast) -> str:
-    """Return what a verdict rests on if that is not both intervals: ``scenes alone`` for one seed."""
-    if contrast.seeds.known and contrast.scenes.known:
-        return ""
-    return "scenes alone" if contrast.scenes.known else "seeds alone" if contrast.seeds.known else "nothing"
 
 
 def about(report: Report) -> str:
