@@ -39,16 +39,10 @@ class Backend(Protocol):
 
     def __call__(self, rgb: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
         """Return depth [m] of RGB images at the model's size."""
-        ...
 
 
 class DepthPipeline(nn.Module):
-    """The network with its pre- and post-processing, RGB bytes to metres; also the graph that is exported.
-
-    Args:
-        net: normalised image to unit depth.
-        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
-    """
+    """A network (normalised image to depth / ``max_depth_m``) from RGB bytes to metres; the graph that is exported."""
 
     def __init__(self, net: nn.Module, *, max_depth_m: float) -> None:
         super().__init__()
@@ -61,13 +55,7 @@ class DepthPipeline(nn.Module):
 
 
 class TorchBackend:
-    """A network in PyTorch.
-
-    Args:
-        net: normalised image to unit depth, in the form in which it runs.
-        info: its description.
-        device: where to run it.
-    """
+    """A network in PyTorch; ``net`` maps a normalised image to unit depth, in the form in which it runs."""
 
     name = "torch"
 
@@ -87,8 +75,7 @@ class TorchBackend:
     ) -> TorchBackend:
         """Return a checkpoint's network in its fastest exact form; ``size`` as in :func:`hudepth.inference.model.load`.
 
-        Raises:
-            HudepthError: if the network cannot be built or does not take the size.
+        Raises HudepthError if the network cannot be built or does not take the size.
         """
         net = checkpoint.build_net(trust=trust)
         info = ModelInfo.of_checkpoint(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size)
@@ -112,13 +99,10 @@ class GraphBackend:
 def open_exported(
     path: Path, *, backend: str = "auto", threads: int, trust: list[str], precision: str = "float32"
 ) -> GraphBackend:
-    """Open an exported file.
+    """Open an exported file; ``auto`` reads ONNX with OpenVINO if installed, since it is faster.
 
-    ``auto`` reads ONNX with OpenVINO if installed, since it is faster. ``.pt2`` files need ``pt2`` in ``trust``.
-
-    Raises:
-        CheckpointError: if it cannot be read, is not trusted, or was not exported by hudepth.
-        ConfigError: if the backend does not read such files or is not installed.
+    Raises CheckpointError if it cannot be read, is not trusted (``.pt2`` needs ``pt2`` in ``trust``), or was not
+    exported by hudepth; ConfigError if the backend does not read such files or is not installed.
     """
     usual = EXPORTED[path.suffix.lower()]
     readers = sorted({usual, "openvino"}) if usual == "onnxruntime" else [usual]

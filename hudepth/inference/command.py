@@ -62,14 +62,7 @@ class Job:
 
 
 def predict(config: dict[str, Any]) -> None:
-    """Predict all inputs, then report what failed.
-
-    Args:
-        config: conf/predict.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user; for unreadable inputs, once all others are done.
-    """
+    """Predict all inputs of conf/predict.yaml; raises HudepthError, for unreadable inputs once all others are done."""
     options = parse(PredictOptions, {**config, "runs": config["paths"]["runs"]})
     camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
     inputs = find_inputs(options.input, recursive=options.recursive)
@@ -116,8 +109,7 @@ def _predict_images(job: Job, items: list[Item]) -> None:
         batch_size=options.batch_size or (16 if on_gpu else 1),  # on CPUs larger batches are slower: caches overflow
         overlap=on_gpu or (options.threads or usable_cores()) < usable_cores(),
     )
-    pictures = ((str(item.path), item.path) for item in items)
-    for _ in track(stream.run(pictures), total=len(items), what="predicting"):
+    for _ in track(stream.run((str(i.path), i.path) for i in items), total=len(items), what="predicting"):
         pass
 
 

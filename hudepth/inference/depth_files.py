@@ -26,25 +26,18 @@ class Style:
     """Of the camera, in pixels of the images; None: NYU's, scaled to each."""
 
 
-Write = Callable[[DepthMap, IO[bytes], Style], object]
-
-FORMATS: dict[str, tuple[str, Write]] = {
+FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] = {
     "png16": ("_depth.png", lambda depth, file, _: file.write(depth.to_png16())),
     "npy": ("_depth.npy", lambda depth, file, _: np.save(file, depth.metres)),
     "colour": ("_depth.jpg", lambda depth, file, style: file.write(jpeg(depth.colourise(scale_m=style.scale_m)))),
     "side": ("_side.jpg", lambda depth, file, style: file.write(jpeg(depth.side_by_side(scale_m=style.scale_m)))),
     "ply": ("_depth.ply", lambda depth, file, style: file.write(depth.point_cloud(style.intrinsics).to_ply())),
 }
-"""By name: the ending of the file's name, and what writes it. ``png16`` is in millimetres, ``npy`` and ``ply`` are in
-metres, ``colour`` and ``side`` are pictures with a scale."""
+"""By name: the file's ending, and what writes it; ``png16`` in mm, ``npy`` and ``ply`` in m, others are pictures."""
 
 
 def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Style) -> None:
-    """Write ``<stem>_depth.png`` and so on in formats of :data:`FORMATS`, each whole or not at all.
-
-    Raises:
-        OSError: if a file cannot be written.
-    """
+    """Write ``<stem>_depth.png`` and so on in formats of :data:`FORMATS`, each whole or not at all; raises OSError."""
     for name in formats:
         ending, write = FORMATS[name]
         with written_whole(stem.with_name(stem.name + ending), durable=False) as part, part.open("wb") as file:

@@ -34,23 +34,16 @@ class DepthMap:
     """What reading changed in the image, if it is not obvious."""
 
     def to_png16(self) -> bytes:
-        """Return a 16-bit PNG file in millimetres, the format of NYU, ScanNet and Kinect tools.
-
-        Depth is rounded to the nearest millimetre and limited to 65.535 m.
-        """
+        """Return a 16-bit PNG file in millimetres, as NYU, ScanNet and Kinect tools use: rounded, at most 65.535 m."""
         return cv2.imencode(".png", to_mm(self.metres), FAST_PNG)[1].tobytes()
 
     def colourise(
         self, *, scale_m: tuple[float, float] | None = None, legend: bool = True
     ) -> UInt8[np.ndarray, "h w2 3"]:
-        """Return depth as RGB colours, near red and far blue, on a fixed scale with a legend in metres.
+        """Return depth as RGB colours, near red and far blue, with a legend in metres.
 
-        Args:
-            scale_m: depths of the two ends of the scale; default: 0 to ``max_depth_m``.
-            legend: whether to append the scale.
-
-        Raises:
-            ConfigError: if the scale is not two rising numbers.
+        ``scale_m`` gives the depths at the ends of the scale (default: 0 to ``max_depth_m``); raises ConfigError if
+        they are not two rising numbers.
         """
         return colour_depth(self.metres, scale_m=scale_m or (0.0, self.max_depth_m), legend=legend)
 
@@ -61,11 +54,8 @@ class DepthMap:
     def point_cloud(self, intrinsics: Intrinsics | tuple[float, float, float, float] | None = None) -> PointCloud:
         """Return one coloured point per pixel.
 
-        Args:
-            intrinsics: fx, fy, cx, cy of the camera [pixels of the image]; default: NYU's, scaled to the image.
-
-        Raises:
-            ConfigError: if they are not those of a camera.
+        ``intrinsics`` are fx, fy, cx, cy of the camera [pixels of the image] (default: NYU's, scaled to the image);
+        raises ConfigError if they are not those of a camera.
         """
         camera = Intrinsics(*intrinsics) if isinstance(intrinsics, tuple) else intrinsics
         return point_cloud(self.metres, self.image, camera)

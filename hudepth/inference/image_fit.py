@@ -25,10 +25,7 @@ class Fitted(NamedTuple):
 
 
 def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: Fit, aspect: float) -> Fitted:
-    """Resize an RGB image to the network's input of (height, width).
-
-    ``aspect`` is width over height of the training images before they were resized; ``letterbox`` pads to it.
-    """
+    """Resize an RGB image to the network's (height, width); ``letterbox`` pads to ``aspect``, width over height."""
     height, width = size
     relative = image.shape[1] / image.shape[0] / aspect  # above 1: wider than the training images
     if fit == "stretch" or relative == 1:

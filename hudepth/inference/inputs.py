@@ -12,7 +12,6 @@ from hudepth.base.errors import DataError
 from hudepth.base.images import SUFFIXES
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
-"""Extensions of videos, in lower case."""
 
 
 class Item(NamedTuple):
@@ -32,14 +31,10 @@ class Inputs(NamedTuple):
 
 
 def find_inputs(spec: str, *, recursive: bool) -> Inputs:
-    """Return the files or camera that ``spec`` names, sorted by name.
+    """Return the files or camera that ``spec`` names, sorted; raises DataError if there is nothing to predict.
 
-    Args:
-        spec: a file, a folder, a pattern with ``*``, ``?`` or ``**``, or the number of a camera.
-        recursive: whether to search subfolders; their names are kept in the results.
-
-    Raises:
-        DataError: if there is nothing to predict.
+    ``spec`` is a file, a folder, a pattern with ``*``, ``?`` or ``**``, or the number of a camera; ``recursive``
+    searches subfolders, whose names are kept in the results.
     """
     if spec.isdecimal() and not Path(spec).exists():
         return Inputs([], [], camera=int(spec))
@@ -49,34 +44,21 @@ def find_inputs(spec: str, *, recursive: bool) -> Inputs:
     elif path.is_file():
         root, files = path.parent, [path]
     else:
-        root = _root_of(path)
+        root = Path(*itertools.takewhile(lambda part: not glob.has_magic(part), path.parts[:-1]))
         files = sorted(root.glob(str(path.relative_to(root)))) if glob.has_magic(str(path)) else []
         if not files:
-            raise DataError(
-                f"input: no file, folder or match '{spec}'. Pass an image, folder, 'pattern', video or camera."
-            )
+            wanted = "an image, folder, 'pattern', video or camera"
+            raise DataError(f"input: no file, folder or match '{spec}'. Pass {wanted}.")
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     alone = path.is_file()  # a file that is named is read, whatever its ending
     images = [f for f in files if f not in videos and (alone or f.suffix.lower() in SUFFIXES)]
     if not images and not videos:
         below = "" if recursive else " Pass recursive=true to search subfolders."
-        raise DataError(
-            f"input: no image or video in '{spec}' ({', '.join(SUFFIXES)}, {', '.join(VIDEO_SUFFIXES)}).{below}"
-        )
-    items = _named(images + videos, root)
-    return Inputs(items[: len(images)], items[len(images) :])
-
-
-def _root_of(pattern: Path) -> Path:
-    return Path(*itertools.takewhile(lambda part: not glob.has_magic(part), pattern.parts[:-1]))
-
-
-def _named(files: list[Path], root: Path) -> list[Item]:
-    """Name results after their files; if two differ only in the ending, it becomes part of the name."""
-    stems = [file.relative_to(root).with_suffix("") for file in files]
-    times = Counter(stems)
-    return [
-        Item(file, stem if times[stem] == 1 else stem.with_name(file.name.replace(".", "_")))
-        for file, stem in zip(files, stems, strict=True)
-    ]
+        raise DataError(f"input: no image or video in '{spec}' ({', '.join(SUFFIXES + VIDEO_SUFFIXES)}).{below}")
+    stems = {file: file.relative_to(root).with_suffix("") for file in images + videos}
+    times = Counter(stems.values())
+    for file, stem in stems.items():
+        if times[stem] > 1:  # two that differ only in the ending, which becomes part of the name
+            stems[file] = stem.with_name(file.name.replace(".", "_"))
+    return Inputs([Item(file, stems[file]) for file in images], [Item(file, stems[file]) for file in videos])

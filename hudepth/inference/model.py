@@ -36,13 +36,7 @@ class Prepared(NamedTuple):
 
 
 class DepthModel:
-    """Predicts depth in metres from single images of any size.
-
-    Args:
-        backend: what computes.
-        fit: how an image is resized to the network's input.
-        flip: average with the mirrored image's prediction, which takes twice the time.
-    """
+    """Predicts depth in metres from single images of any size; ``fit`` and ``flip`` as in :func:`load`."""
 
     def __init__(self, backend: Backend, *, fit: Fit = "stretch", flip: bool = False) -> None:
         self.backend, self.flip = backend, flip
@@ -54,20 +48,12 @@ class DepthModel:
         return self.backend.info
 
     def predict(self, image: Picture) -> DepthMap:
-        """Predict the depth of one image, at its own size.
-
-        Raises:
-            DataError: if the image cannot be read.
-        """
+        """Predict the depth of one image, at its own size; raises DataError if it cannot be read."""
         prepared = self.prepare(image)
         return self.finish(prepared, self.run([prepared])[0])
 
     def predict_many(self, images: Iterable[Picture], *, batch_size: int = 1) -> list[DepthMap]:
-        """Predict the depth of several images, ``batch_size`` at a time.
-
-        Raises:
-            DataError: if one cannot be read.
-        """
+        """Predict the depth of several images, ``batch_size`` at a time; raises DataError if one cannot be read."""
         prepared = [self.prepare(image) for image in images]
         depths = [d for at in range(0, len(prepared), batch_size) for d in self.run(prepared[at : at + batch_size])]
         return [self.finish(each, depth) for each, depth in zip(prepared, depths, strict=True)]
@@ -140,9 +126,7 @@ def load(
         trust: further packages whose classes a checkpoint may name; ``pt2`` to load a ``.pt2`` file.
         runs: where ``last`` looks.
 
-    Raises:
-        CheckpointError: if it is missing, damaged, not trusted, or not a model of hudepth.
-        ConfigError: if an option does not fit.
+    Raises CheckpointError if it is missing, damaged, not trusted or not a model of hudepth, ConfigError for options.
     """
     values = {
         "checkpoint": str(spec), "backend": backend, "device": device, "precision": precision, "threads": threads,
@@ -159,22 +143,17 @@ def load_model(chosen: ModelOptions) -> DepthModel:
         if chosen.size is not None:
             raise ConfigError(f"size: '{path.name}' has a fixed size. Leave size out.")
         if not path.is_file():
-            raise ConfigError(
-                f"checkpoint: no file '{path}'. Pass a checkpoint, run directory, bundle or exported file."
-            )
+            wanted = "a checkpoint, run directory, bundle or exported file"
+            raise ConfigError(f"checkpoint: no file '{path}'. Pass {wanted}.")
         torch.set_num_threads(threads)
         backend = open_exported(
             path, backend=chosen.backend, threads=threads, trust=chosen.trust, precision=chosen.precision
         )
         return DepthModel(backend, fit=chosen.fit, flip=chosen.flip)
-    for key, value, usable in (
-        ("backend", chosen.backend, ("auto", "torch")), ("precision", chosen.precision, ("float32",)),
-    ):  # fmt: skip
-        if value not in usable:
-            raise ConfigError(
-                f"{key}={value}: needs an exported file. Run hudepth-export checkpoint={chosen.checkpoint} "
-                "format=openvino first."
-            )
+    for key, usable in (("backend", ("auto", "torch")), ("precision", ("float32",))):
+        if (value := getattr(chosen, key)) not in usable:
+            run = f"hudepth-export checkpoint={chosen.checkpoint} format=openvino"
+            raise ConfigError(f"{key}={value}: needs an exported file. Run {run} first.")
     device = torch_device(chosen.device)
     if device.type == "cpu":
         torch.set_num_threads(threads)

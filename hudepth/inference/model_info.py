@@ -51,11 +51,7 @@ class ModelInfo:
 
     @classmethod
     def from_json(cls, text: str, *, where: str) -> ModelInfo:
-        """Read what :meth:`to_json` wrote; values out of range are rejected.
-
-        Raises:
-            CheckpointError: if it is not such a description.
-        """
+        """Read what :meth:`to_json` wrote; raises CheckpointError for anything else and for values out of range."""
         try:
             content = json.loads(text)
             if not isinstance(content, Mapping) or content.get("version") != VERSION:
@@ -73,8 +69,7 @@ class ModelInfo:
     ) -> ModelInfo:
         """Describe a checkpoint, at the input size of its training unless another is given.
 
-        Raises:
-            CheckpointError: if it does not record its training data.
+        Raises CheckpointError if it does not record its training data.
         """
         data: Any = checkpoint.config.get("data")
         try:

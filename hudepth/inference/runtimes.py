@@ -15,9 +15,7 @@ PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
 def onnx_session(path: Path, *, threads: int) -> Any:
     """Open an ONNX file in ONNX Runtime, on the CPU.
 
-    Raises:
-        ConfigError: if ONNX Runtime is not installed.
-        Exception: whatever ONNX Runtime raises for a file that it cannot read.
+    Raises ConfigError if ONNX Runtime is not installed, and whatever it raises for a file that it cannot read.
     """
     runtime = package("onnxruntime", extra="onnx")
     options = runtime.SessionOptions()
@@ -29,26 +27,17 @@ def onnx_session(path: Path, *, threads: int) -> Any:
 def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:
     """Open an IR (``.xml`` next to its ``.bin``) or ONNX file in OpenVINO: the model as read, and an inference request.
 
-    Raises:
-        ConfigError: if OpenVINO is not installed.
-        Exception: whatever OpenVINO raises for a file that it cannot read.
+    Raises ConfigError if OpenVINO is not installed, and whatever it raises for a file that it cannot read.
     """
     core = package("openvino", extra="openvino").Core()
-    options = {
-        "PERFORMANCE_HINT": "LATENCY",
-        "INFERENCE_PRECISION_HINT": PRECISIONS[precision],
-        "INFERENCE_NUM_THREADS": threads,
-    }
+    options = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision], "INFERENCE_NUM_THREADS": threads}
+    options["PERFORMANCE_HINT"] = "LATENCY"
     model = core.read_model(path)
     return model, core.compile_model(model, "CPU", options).create_infer_request()
 
 
 def package(name: str, *, extra: str) -> Any:
-    """Import a package that an extra of hudepth installs.
-
-    Raises:
-        ConfigError: if it is not installed.
-    """
+    """Import a package that an extra of hudepth installs; raises ConfigError if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -45,9 +45,7 @@ class Stream(Generic[Key]):
     write: Callable[[Key, DepthMap], None]
     """Called in a thread with each image's key and depth."""
     tally: Tally = field(kw_only=True)
-    """Where to count results."""
     batch_size: int = field(default=1, kw_only=True)
-    """Images that go through the network together."""
     workers: int = field(default=2, kw_only=True)
     """Threads that decode and write; one keeps the order."""
     overlap: bool = field(default=False, kw_only=True)
@@ -57,14 +55,9 @@ class Stream(Generic[Key]):
     _previous: Float[np.ndarray, "h w"] | None = field(default=None, init=False)
 
     def run(self, pictures: Iterable[tuple[Key, Picture]]) -> Iterator[Key]:
-        """Predict and write; yield each key once its image has been predicted or found unreadable.
+        """Predict and write; yield each key once its image is predicted, or noted in ``tally`` as unreadable.
 
-        Args:
-            pictures: keys, which name an image in messages, and images. Unreadable images are noted in ``tally`` and
-                skipped.
-
-        Raises:
-            OSError: if a result cannot be written; earlier results are kept.
+        Keys name images in messages. Raises OSError if a result cannot be written; earlier results are kept.
         """
         with ThreadPoolExecutor(self.workers) as pool:
             writing: list[Future[None]] = []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -25,13 +24,9 @@ CODEC = "mp4v"
 
 
 class FrameReader:
-    """Frames of a video file or a camera, upright RGB, one at a time.
+    """Frames of a video file or of the camera of a number, upright RGB, one at a time.
 
-    Args:
-        source: a file, or the number of a camera.
-
-    Raises:
-        DataError: if it cannot be opened, or its frames are too large.
+    Raises DataError if it cannot be opened, or its frames are too large.
     """
 
     def __init__(self, source: Path | int) -> None:
@@ -40,21 +35,18 @@ class FrameReader:
         self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
         if not self._capture.isOpened():
             self._capture.release()
+            fix = "It is not a video or is cut off before its index; convert it to .mp4."
             if isinstance(source, int):
-                raise DataError(f"{self.name}: cannot be opened. Pass the number of a connected camera.")
-            raise DataError(
-                f"{self.name}: cannot be opened. It is not a video or is cut off before its index; convert it to .mp4."
-            )
+                fix = "Pass the number of a connected camera."
+            raise DataError(f"{self.name}: cannot be opened. {fix}")
         width, height = (int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         check_pixels(height, width, where=self.name)
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        self.rate = rate if 0 < rate < 1000 else DEFAULT_RATE
-        """Frames per second."""
+        self.rate = rate if 0 < rate < 1000 else DEFAULT_RATE  # frames per second
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.expected = int(count) if not isinstance(source, int) and 0 < count < 1e9 else None
         """Number of frames that the file states; None for a camera."""
         self.read = 0
-        """Number of frames read so far."""
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         """Yield the remaining frames."""
@@ -77,12 +69,7 @@ class FrameReader:
 
 
 class VideoWriter:
-    """A video file that appears when the block ends, with all frames written so far, even after an error.
-
-    Args:
-        path: an ``.mp4``; its folder is created.
-        rate: frames per second.
-    """
+    """An ``.mp4`` that appears when the block ends, with all frames written so far, even after an error."""
 
     def __init__(self, path: Path, *, rate: float) -> None:
         self.path, self._rate = path, rate
@@ -96,21 +83,17 @@ class VideoWriter:
     def write(self, rgb: UInt8[np.ndarray, "h w 3"]) -> None:
         """Add a frame; all must have the size of the first. Odd sides lose a pixel, since the codec needs even ones.
 
-        Raises:
-            DataError: if the video cannot be written.
+        Raises DataError if the video cannot be written.
         """
         even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
         if self._writer is None:
             size = (even.shape[1], even.shape[0])
-            code = cv2.VideoWriter.fourcc(*CODEC)
-            self._writer = cv2.VideoWriter(str(self._part), code, self._rate, size)
+            self._writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*CODEC), self._rate, size)
             if not self._writer.isOpened():
                 raise DataError(f"'{self.path}': cannot write a video of {size[0]} x {size[1]} there.")
         self._writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._writer is not None:
             self._writer.release()
         if self._part.exists():
