@@ -20,8 +20,7 @@ from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel
 from hudepth.viz.colour import colour_depth
 
-MAX_SIDE = 640
-"""Of the map that goes to the browser [pixels]: more than the networks resolve, and less than a megabyte."""
+MAX_SIDE = 640  # of the map that goes to the browser [pixels]: more than the networks resolve, and less than a megabyte
 
 
 class Limits(NamedTuple):
@@ -35,28 +34,17 @@ class Limits(NamedTuple):
 class Answer:
     """The depth of a picture, at its own size and as shown."""
 
-    name: str
-    """File name of the picture, without its ending."""
+    name: str  # of the picture's file, without its ending
     depth: DepthMap
-    shown: DepthMap
-    """The same, with sides of at most :data:`MAX_SIDE`; its pixels are picked from ``depth``, not averaged."""
-    camera: Intrinsics
-    """In pixels of ``shown``."""
-    payload: dict[str, Any]
-    """Input of the page's script."""
+    shown: DepthMap  # the same, with sides of at most MAX_SIDE; its pixels are picked from depth, not averaged
+    camera: Intrinsics  # in pixels of ``shown``
+    payload: dict[str, Any]  # input of the page's script
 
 
 def answer(path: Path, model: DepthModel, limits: Limits, intrinsics: Intrinsics | None = None) -> Answer:
-    """Predict the depth of an uploaded picture.
+    """Predict the depth of an uploaded picture; raises DataError with one line for the visitor.
 
-    Args:
-        path: the file.
-        model: what predicts.
-        limits: the largest picture that is accepted.
-        intrinsics: of the camera, in pixels of the picture; None: NYU's, scaled.
-
-    Raises:
-        DataError: with one line for the visitor.
+    ``intrinsics`` are those of the camera, in pixels of the picture; None stands for NYU's, scaled.
     """
     start = time.perf_counter()
     data = _read_upload(path, limits.upload_bytes)
@@ -95,9 +83,8 @@ def reduce_depth(depth: DepthMap, max_side: int = MAX_SIDE) -> DepthMap:
     if shrink <= 1:
         return depth
     rows, columns = (max(1, round(length / shrink)) for length in shape)
-    centres = [
-        ((np.arange(n) + 0.5) * (length / n)).astype(np.intp) for n, length in zip((rows, columns), shape, strict=True)
-    ]
+    pairs = zip((rows, columns), shape, strict=True)
+    centres = [((np.arange(n) + 0.5) * (length / n)).astype(np.intp) for n, length in pairs]
     image = resize_image(depth.image, (rows, columns))
     return DepthMap(depth.metres[np.ix_(*centres)], image, depth.max_depth_m, depth.notes)
 

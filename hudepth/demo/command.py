@@ -31,14 +31,7 @@ class DemoOptions(ModelOptions):
 
 
 def demo(config: dict[str, Any]) -> None:
-    """Serve the page until Ctrl-C.
-
-    Args:
-        config: conf/demo.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user.
-    """
+    """Serve the page as conf/demo.yaml states until Ctrl-C; raises HudepthError."""
     if importlib.util.find_spec("gradio") is None:
         raise ConfigError("gradio is not installed. Run pip install 'hudepth[demo]'.")
     options = parse(DemoOptions, {**config, "runs": config["paths"]["runs"]})
@@ -47,12 +40,9 @@ def demo(config: dict[str, Any]) -> None:
     free_port(options.host, options.port)  # before the seconds that loading takes
     model = load_model(options)
     model.predict(np.zeros((*model.info.size, 3), np.uint8))  # the first run is slow; visitors should not wait for it
-
-    def ready(address: str) -> None:
-        log.info("model: %s; open %s (Ctrl-C stops)", model.info, address)
-
     serve(
         partial(answer, model=model, limits=limits, intrinsics=camera),
-        host=options.host, port=options.port, limits=limits, info=model.info, ready=ready,
+        host=options.host, port=options.port, limits=limits, info=model.info,
+        ready=partial(log.info, "model: %s; open %s (Ctrl-C stops)", model.info),
         camera="as given" if camera else "NYU Depth V2's, since intrinsics= is not set",
     )  # fmt: skip

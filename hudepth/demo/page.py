@@ -21,22 +21,13 @@ FONTS = ["ui-sans-serif", "system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "
 MONO = ["ui-monospace", "Menlo", "Consolas", "monospace"]
 """Common system fonts; gradio's own themes would load others from the web."""
 BUTTONS = ("PNG16 (mm)", "npy (m)", "PLY (m)")
-KEEP_S = (600, 3600)
-"""How often gradio deletes files that no session owns, and their maximum age [s]."""
+KEEP_S = (600, 3600)  # how often gradio deletes files that no session owns, and their maximum age [s]
 
 
 def build(
     compute: Callable[[Path], Answer], files: Files, examples: list[Path], *, info: ModelInfo, camera: str
 ) -> gr.Blocks:
-    """Lay out the page.
-
-    Args:
-        compute: predicts an uploaded file; raises HudepthError with one line for the page.
-        files: where results go.
-        examples: pictures to offer.
-        info: of the model.
-        camera: whose intrinsics the point cloud uses, in words.
-    """
+    """Lay out the page; arguments as for :func:`hudepth.demo.server.serve`. Results go to ``files``."""
     gr.set_static_paths([files.examples, files.results])  # served in place, not copied
     blocks: gr.Blocks = gr.Blocks(title="hudepth", analytics_enabled=False, delete_cache=KEEP_S, fill_width=True)
     with blocks:
@@ -48,15 +39,13 @@ def build(
                     buttons=["fullscreen"], alt_text="The picture you chose", elem_id="picture",
                     webcam_options=gr.WebcamOptions(mirror=False, constraints={"video": {"facingMode": "environment"}}),
                 )  # fmt: skip
-                gr.Examples(
-                    [[str(path)] for path in examples], [image], label="Examples: rendered rooms", elem_id="rooms"
-                )
+                rooms = [[str(path)] for path in examples]
+                gr.Examples(rooms, [image], label="Examples: rendered rooms", elem_id="rooms")
             with gr.Column(scale=5, min_width=320):
                 viewer = _viewer()
                 with gr.Row(elem_id="downloads"):
-                    buttons = [
-                        gr.DownloadButton(label, interactive=False, size="md", min_width=80) for label in BUTTONS
-                    ]
+                    off: dict[str, Any] = {"interactive": False, "size": "md", "min_width": 80}
+                    buttons = [gr.DownloadButton(label, **off) for label in BUTTONS]
         # gradio's own would open the file, with every decoder that Pillow has
         vars(image)["preprocess"] = lambda payload: payload and payload.path
         image.change(
@@ -72,10 +61,7 @@ def build(
 
 
 def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., Iterator[tuple[Any, ...]]]:
-    """Return the function for each new picture, which yields the viewer's value and the three buttons.
-
-    The depth is shown before the files are written, which takes a while for large pictures.
-    """
+    """Return the function for each new picture: it yields the depth first, then the buttons, whose files take long."""
     off = tuple(gr.update(value=None, interactive=False) for _ in BUTTONS)
 
     def show(upload: str | None, request: gr.Request) -> Iterator[tuple[Any, ...]]:
@@ -87,11 +73,9 @@ def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., It
         files.begin(session, Path(upload))
         try:
             answer = compute(Path(upload))
-        except HudepthError as error:
-            yield ({"error": str(error)}, *off)
-            return
-        except MemoryError:
-            yield ({"error": "This machine has too little memory for the picture. Resize it."}, *off)
+        except (HudepthError, MemoryError) as error:
+            lack = "This machine has too little memory for the picture. Resize it."
+            yield ({"error": lack if isinstance(error, MemoryError) else str(error)}, *off)
             return
         yield (answer.payload, *off)
         try:
@@ -105,14 +89,10 @@ def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., It
 
 
 def _viewer() -> gr.HTML:
-    return gr.HTML(
-        None,
-        html_template=data_file("viewer.html"),
-        js_on_load=data_file("points.js") + data_file("viewer.js"),
-        apply_default_css=False,
-        elem_id="viewer",
-        colours=base64.b64encode(colour_table().tobytes()).decode(),
-    )
+    colours = base64.b64encode(colour_table().tobytes()).decode()
+    html, script = data_file("viewer.html"), data_file("points.js") + data_file("viewer.js")
+    style: dict[str, Any] = {"apply_default_css": False, "elem_id": "viewer"}
+    return gr.HTML(None, html_template=html, js_on_load=script, colours=colours, **style)
 
 
 def headline(info: ModelInfo, camera: str) -> str:

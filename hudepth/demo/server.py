@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from hudepth.base.errors import ConfigError
@@ -55,11 +54,7 @@ class Policy:
 
 
 def free_port(host: str, port: int) -> int:
-    """Return ``port``, or a free one for 0.
-
-    Raises:
-        ConfigError: if it is taken, or the host is not an address of this machine.
-    """
+    """Return ``port``, or a free one for 0; raises ConfigError if it is taken or the host not one of this machine."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         with socket.socket(family, socket.SOCK_STREAM) as trial:
@@ -70,9 +65,8 @@ def free_port(host: str, port: int) -> int:
     except socket.gaierror:
         raise ConfigError(f"host: no address '{host}'. Pass host=127.0.0.1, or 0.0.0.0 for all networks.") from None
     except OSError as error:
-        raise ConfigError(
-            f"port: {host}:{port} is not available ({error.strerror}). Pass another port=, or port=0 for any free one."
-        ) from None
+        fix = "Pass another port=, or port=0 for any free one."
+        raise ConfigError(f"port: {host}:{port} is not available ({error.strerror}). {fix}") from None
 
 
 def serve(
@@ -85,19 +79,16 @@ def serve(
     camera: str,
     ready: Callable[[str], None],
 ) -> None:
-    """Serve the page until the process is interrupted or terminated.
+    """Serve the page until the process is interrupted or terminated; raises ConfigError if the port is taken.
 
     Args:
-        compute: predicts an uploaded file.
+        compute: predicts an uploaded file; raises HudepthError with one line for the page.
         host: address to listen on.
         port: to listen on; 0 takes a free one.
         limits: the largest picture that is accepted.
-        info: of the model, for the page.
-        camera: whose intrinsics the point cloud uses, for the page.
+        info: of the model.
+        camera: whose intrinsics the point cloud uses, in words.
         ready: called with the page's address once it responds.
-
-    Raises:
-        ConfigError: if the port is taken.
     """
     port = free_port(host, port)
     atexit.register(gc.freeze)  # skips a last garbage collection of all of gradio: two seconds
@@ -107,8 +98,7 @@ def serve(
 
         from hudepth.demo import page
 
-        examples = draw_examples(files.examples)
-        blocks = page.build(compute, files, examples, info=info, camera=camera)
+        blocks: Any = page.build(compute, files, draw_examples(files.examples), info=info, camera=camera)
         try:
             _, address, _ = blocks.launch(
                 server_name=host, server_port=port, share=False, inbrowser=False, prevent_thread_lock=True, quiet=True,
@@ -118,16 +108,11 @@ def serve(
             )  # fmt: skip
             ready(address.rstrip("/"))
             ended.wait()
-        finally:
-            _close(blocks)
-
-
-def _close(blocks: Any) -> None:
-    """Stop the server at once: it would wait for open pages, and log an error when interrupted."""
-    logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
-    if blocks.server is not None:
-        blocks.server.force_exit = True
-    blocks.close(verbose=False)
+        finally:  # at once: the server would wait for open pages, and log an error when interrupted
+            logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
+            if blocks.server is not None:
+                blocks.server.force_exit = True
+            blocks.close(verbose=False)
 
 
 def _silence(uploads: Path) -> None:
@@ -146,11 +131,7 @@ def _ended_by_signals() -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield ended
         return
-
-    def end(_number: int, _frame: FrameType | None) -> None:
-        ended.set()
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield ended
     finally:

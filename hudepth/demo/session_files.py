@@ -8,7 +8,6 @@ import tempfile
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -16,11 +15,9 @@ from hudepth.data.sources.rooms import RoomsSource
 from hudepth.demo.answers import Answer
 from hudepth.inference.depth_files import FORMATS, Style, jpeg
 
-EXAMPLE_ROOMS = (3, 1, 2, 0)
-"""Scenes of the synthetic rooms: a living room, a kitchen, an office, a bedroom."""
+EXAMPLE_ROOMS = (3, 1, 2, 0)  # scenes of the synthetic rooms: a living room, a kitchen, an office, a bedroom
 EXAMPLE_SIZE = (480, 640)
-DOWNLOADS = ("png16", "npy", "ply")
-"""Formats that can be downloaded, in the order of the buttons."""
+DOWNLOADS = ("png16", "npy", "ply")  # formats that can be downloaded, in the order of the buttons
 
 
 @dataclass
@@ -43,28 +40,22 @@ class Files:
             folder.mkdir()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         shutil.rmtree(self.root, ignore_errors=True)
 
     def begin(self, session: str, upload: Path) -> None:
         """Record what a session uploaded, and delete its previous files."""
         uploaded = upload if upload.is_relative_to(self.uploads) else None  # examples are kept
-        self._replace(session, _Session(uploaded))
+        self.end(session, _Session(uploaded))
 
-    def end(self, session: str) -> None:
+    def end(self, session: str, successor: _Session | None = None) -> None:
         """Delete everything that belongs to this session only."""
-        self._replace(session, None)
-
-    def _replace(self, session: str, now: _Session | None) -> None:
         with self._lock:
             before = self._sessions.pop(session, _Session())
-            if now is not None:
-                self._sessions[session] = now
-            kept = {
-                each.upload for each in self._sessions.values()
-            }  # gradio stores a picture uploaded twice as one file
+            if successor is not None:
+                self._sessions[session] = successor
+            # gradio stores a picture uploaded twice as one file
+            kept = {each.upload for each in self._sessions.values()}
             if before.upload is not None and before.upload not in kept:
                 before.upload.unlink(missing_ok=True)
         if before.results is not None:
@@ -73,10 +64,7 @@ class Files:
     def write(self, session: str, answer: Answer) -> list[Path]:
         """Write a session's downloads, in the order of :data:`DOWNLOADS`, into a folder with an unguessable name.
 
-        PNG and npy have the size of the picture; the point cloud has the points that are shown.
-
-        Raises:
-            OSError: if a file cannot be written.
+        PNG and npy have the size of the picture; the point cloud has the points that are shown. Raises OSError.
         """
         folder = self.results / secrets.token_urlsafe(16)
         folder.mkdir()

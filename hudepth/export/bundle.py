@@ -17,10 +17,8 @@ from hudepth.inference.model_info import ModelInfo
 from hudepth.runs.bundles import CARD, CONFIG, KIND, ONNX, WEIGHTS
 from hudepth.runs.checkpoint import VERSION, Checkpoint
 
-PLACES = ("root", "cache")
-"""Keys of ``data`` that name paths on the machine of the training; they are not published."""
-PARTS = ("name", "seed", "model", "data", "loss", "optim", "schedule")
-"""Parts of a run's configuration that the bundle contains."""
+PLACES = ("root", "cache")  # keys of data that name paths on the machine of the training; they are not published
+PARTS = ("name", "seed", "model", "data", "loss", "optim", "schedule")  # of a run's configuration
 
 
 def write_bundle(

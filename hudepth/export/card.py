@@ -30,7 +30,7 @@ def model_card(
     checkpoint: Checkpoint, info: ModelInfo, *, name: str, results: Mapping[str, Mapping[str, Any]], parity: str,
     samples: int = 0, origin: str = "", half: bool = False, trust: Iterable[str] = (),
 ) -> str:  # fmt: skip
-    """Write the card of a model.
+    """Return the card of a model, as Markdown with the header that model hubs read.
 
     Args:
         checkpoint: records how it was trained.
@@ -38,18 +38,17 @@ def model_card(
         name: of the model.
         results: contents of ``metrics.json`` by protocol; may be empty.
         parity: the difference between the checkpoint and the ONNX file or 16-bit weights, in words.
-        samples: number of sample pictures.
-        origin: of the samples, for example ``test images of nyu_labeled``.
+        samples: number of sample pictures, which show ``origin``, for example ``test images of nyu_labeled``.
         half: kernels and matrices are stored as 16-bit floats, and there is no ONNX file.
         trust: packages whose data sets may be imported for their terms.
-
-    Returns:
-        Markdown with the header that model hubs read.
     """
     source, data_set = str(checkpoint.data.get("source", "unknown")), _source_class(checkpoint, trust)
+    tags = ["depth-estimation", "monocular-depth", *["onnx"] * (not half), "hudepth"]
     sections = (
-        _header(data_set.licence, onnx=not half), f"# {name}", _about(info), _use(info, parity, half=half),
-        _training(checkpoint, source), _results(results), _samples(samples, origin), _limits(info, source),
+        f"---\nlibrary_name: hudepth\npipeline_tag: depth-estimation\nlicense: {data_set.licence}\ntags:\n- "
+        + "\n- ".join(tags) + f"\n---\n\n# {name}", _about(info), _use(info, parity, half=half),
+        _training(checkpoint, source), _results(results), _samples(samples, origin) if samples else "",
+        _limits(info, source),
         "## Licence\n\nCode: MIT. Training data: "
         + (data_set.terms or f"'{source}', whose terms the publisher of this model must state here.")
         + " What this means for the weights is for you to judge.",
@@ -66,11 +65,6 @@ def _source_class(checkpoint: Checkpoint, trust: Iterable[str]) -> type[Source]:
     except ConfigError:
         return Source
     return found if issubclass(found, Source) else Source
-
-
-def _header(licence: str, *, onnx: bool) -> str:
-    tags = "\n".join(f"- {tag}" for tag in ("depth-estimation", "monocular-depth", *["onnx"] * onnx, "hudepth"))
-    return f"---\nlibrary_name: hudepth\npipeline_tag: depth-estimation\nlicense: {licence}\ntags:\n{tags}\n---"
 
 
 def _about(info: ModelInfo) -> str:
@@ -120,7 +114,6 @@ def _training(checkpoint: Checkpoint, source: str) -> str:
 
 
 def _loss(loss: Mapping[str, Any]) -> str:
-    """Return the name of a loss, or the parts of a mixture."""
     names = [f"{weight:g} {_class(loss['losses'][part])}" for part, weight in loss.get("weights", {}).items() if weight]
     return " + ".join(names) or _class(loss)
 
@@ -152,13 +145,9 @@ def _cell(name: str, value: float | None, ends: Any) -> str:
 
 
 def _samples(count: int, origin: str) -> str:
-    if not count:
-        return ""
     pictures = "\n".join(f"![image and predicted depth](samples/{number}.jpg)" for number in range(count))
-    return (
-        f"## Samples\n\n{pictures}\n\nFrom the {origin}, not selected by hand. Left: the image at the network's size, "
-        "right: its depth."
-    )
+    caption = "not selected by hand. Left: the image at the network's size, right: its depth."
+    return f"## Samples\n\n{pictures}\n\nFrom the {origin}, {caption}"
 
 
 def _limits(info: ModelInfo, source: str) -> str:

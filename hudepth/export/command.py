@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,15 +64,12 @@ class Work:
 
     options: ExportOptions
     checkpoint: Checkpoint
-    net: nn.Module
-    """In the form in which it runs."""
-    reference: TorchBackend
-    """The network as trained, with which exports are compared."""
+    net: nn.Module  # in the form in which it runs
+    reference: TorchBackend  # the network as trained, with which exports are compared
     info: ModelInfo
     images: ComparisonImages
     output: Path
-    folder: Path
-    """Where files are made before they are checked."""
+    folder: Path  # where files are made before they are checked
 
     def onnx(self, info: ModelInfo) -> Path:
         """Return an ONNX file, from which other formats start, with or without processing as ``info`` states."""
@@ -93,21 +90,11 @@ class Work:
         for path in paths:
             path.replace(self.output / path.name)
         log.info("%s: %s", self.output / paths[0].name, parity)
-        return {
-            "files": [path.name for path in paths],
-            "compared": {"images": parity.images, "worst_mm": parity.worst_mm, "mean_mm": parity.mean_mm},
-        }
+        return {"files": [path.name for path in paths], "compared": asdict(parity)}
 
 
 def export(config: dict[str, Any]) -> None:
-    """Export a checkpoint in the configured formats.
-
-    Args:
-        config: conf/export.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user; formats exported before the error are kept.
-    """
+    """Export a checkpoint as conf/export.yaml states; raises HudepthError, and keeps formats exported before it."""
     options = parse(ExportOptions, {**config, **config["paths"]})
     if "int8" in options.format:
         check_calibration(options.calibration)
@@ -134,17 +121,15 @@ def export(config: dict[str, Any]) -> None:
             for name in options.format:
                 record[name] = MAKERS[name](work)
     except OSError as error:
-        raise ConfigError(
-            f"output: cannot write to '{output}' ({error.strerror or error}). Free some space."
-        ) from error
+        reason = error.strerror or error
+        raise ConfigError(f"output: cannot write to '{output}' ({reason}). Free some space.") from error
     finally:
         if record:
             write_json(output / "export.json", {"images": images.origin, **record})
 
 
 def _onnx(work: Work) -> dict[str, Any]:
-    path = work.folder / "model.onnx"
-    shutil.copyfile(work.onnx(work.info), path)
+    path = Path(shutil.copyfile(work.onnx(work.info), work.folder / "model.onnx"))
     return work.keep(path, parity=work.compare(path, backend="onnxruntime"))
 
 
@@ -191,7 +176,9 @@ def _bundle(work: Work) -> dict[str, Any]:
         parity = work.compare(onnx, backend="onnxruntime")
     model = DepthModel(work.reference)
     samples = [model.predict(image) for image in images.compared[:: max(1, len(images.compared) // 3)][:3]]
-    results = _read_results(work.checkpoint)
+    run = work.checkpoint.run
+    files = sorted((run / "test").glob("*/metrics.json")) if run else []
+    results = {file.parent.name: json.loads(file.read_text(encoding="utf-8")) for file in files}
     folder = work.folder / name
     card = model_card(
         work.checkpoint, info, name=name, results=results, parity=str(parity), half=options.half,
@@ -218,11 +205,3 @@ def _bundle_name(checkpoint: Checkpoint, options: ExportOptions) -> str:
     if not options.zip and folder.exists():
         raise ConfigError(f"'{folder}' exists. Remove it, or pass another name= or output=.")
     return name
-
-
-def _read_results(checkpoint: Checkpoint) -> dict[str, dict[str, Any]]:
-    """Return the results of the run's own tests, by protocol."""
-    if checkpoint.run is None:
-        return {}
-    files = sorted((checkpoint.run / "test").glob("*/metrics.json"))
-    return {file.parent.name: json.loads(file.read_text(encoding="utf-8")) for file in files}

@@ -28,7 +28,6 @@ class ComparisonImages:
     calibration: UInt8[np.ndarray, "m h w 3"]
     origin: str
     datamodule: DepthDataModule | None = None
-    """The checkpoint's data, if it is available."""
 
 
 def find_images(
@@ -41,27 +40,15 @@ def find_images(
     data: Mapping[str, Any],
     trust: list[str],
 ) -> ComparisonImages:
-    """Return images of a folder, of the checkpoint's data, or of synthetic rooms.
+    """Return at least one image each to compare and to calibrate with: of a folder, the checkpoint's data, or rooms.
 
-    Of the checkpoint's data, test images are compared and training images calibrate, so that accuracy is measured on
-    images that calibration did not see.
-
-    Args:
-        checkpoint: records its training data.
-        folder: of images; None: the checkpoint's data, else rooms.
-        size: (height, width) of the model's input.
-        compared: number of images to compare, at least 1.
-        calibration: number of images to calibrate with, at least 1.
-        data: changes to the checkpoint's data configuration.
-        trust: packages whose classes that configuration may name.
-
-    Raises:
-        HudepthError: if the folder has no readable image, or data that ``data`` points to cannot be opened.
+    Of the checkpoint's data, as changed by ``data``, test images are compared and training images calibrate, so that
+    accuracy is measured on images that calibration did not see. Raises HudepthError if the folder has no readable
+    image, or data that ``data`` points to cannot be opened.
     """
     most = max(compared, calibration)
     if folder is not None:
-        items = find_inputs(folder, recursive=True).images
-        if not items:
+        if not (items := find_inputs(folder, recursive=True).images):
             raise DataError(f"images: no image in '{folder}'.")
         chosen = [items[i].path for i in _spread(len(items), most)]
         images = np.stack([resize_image(read_photo(path).rgb, size) for path in chosen])

@@ -21,8 +21,7 @@ from hudepth.inference.runtimes import package
 
 OPSET = 18
 INPUT = "image"
-OUTPUTS = {True: "depth_m", False: "unit_depth"}
-"""Name of the output, by whether the graph includes pre- and post-processing."""
+OUTPUTS = {True: "depth_m", False: "unit_depth"}  # by whether the graph includes pre- and post-processing
 
 
 def export_graph(net: nn.Module, info: ModelInfo) -> tuple[nn.Module, Tensor]:
@@ -55,11 +54,7 @@ def describe(info: ModelInfo) -> dict[str, str]:
 
 
 def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
-    """Write a network (normalised image to unit depth) as ONNX for any batch size, with torch's dynamo exporter.
-
-    Raises:
-        ConfigError: if ``onnx`` or ``onnxscript`` is not installed.
-    """
+    """Write a network (normalised image to unit depth) as ONNX; raises ConfigError if onnx or onnxscript is missing."""
     for name in ("onnx", "onnxscript"):
         package(name, extra="onnx")
     graph, image = export_graph(net, info)
@@ -88,11 +83,7 @@ def export_program(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
 
 
 def export_openvino(onnx: Path, path: Path, *, info: ModelInfo) -> None:
-    """Convert an ONNX file to OpenVINO's format (``.xml``, ``.bin``), with float32 weights.
-
-    Raises:
-        ConfigError: if ``openvino`` is not installed.
-    """
+    """Convert an ONNX file to OpenVINO's ``.xml`` and ``.bin``; raises ConfigError if OpenVINO is not installed."""
     save_openvino(package("openvino", extra="openvino").Core().read_model(onnx), path, info=info)
 
 
@@ -113,8 +104,7 @@ def _quiet() -> Iterator[None]:
     try:
         for logger in loggers:
             logger.setLevel(logging.ERROR)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         for logger, level in zip(loggers, levels, strict=True):

@@ -49,21 +49,10 @@ def measure_int8(
     protocols: Mapping[str, Any],
     trust: list[str],
 ) -> dict[str, Any]:
-    """Test a network and its int8 form, print the change, and note the test in the checkpoint's run.
+    """Test a network and its int8 form on the test subset, print the change, and note the test in the run.
 
-    Args:
-        checkpoint: what was quantised.
-        reference: its network as trained.
-        quantised: its int8 form.
-        datamodule: provides the test subset.
-        protocols: configurations, whose classes must be hudepth's or under ``trust``.
-        trust: further packages.
-
-    Returns:
-        By protocol and metric: both values, their difference and its 95 % interval over scenes.
-
-    Raises:
-        HudepthError: with one line for the user.
+    Returns, by protocol and metric, both values, their difference and its 95 % interval over scenes. Raises
+    HudepthError, also if a class in ``protocols`` is neither hudepth's nor under ``trust``.
     """
     built = build_protocols(protocols, datamodule=datamodule, trust=trust)
     predictors: dict[str, nn.Module] = {FLOAT: reference.pipeline.net, INT8: _BackendNet(quantised)}

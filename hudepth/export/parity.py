@@ -17,7 +17,6 @@ class Parity:
 
     images: int
     worst_mm: float
-    """Largest difference at any pixel."""
     mean_mm: float
 
     def __str__(self) -> str:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -17,28 +15,19 @@ from hudepth.export.graphs import save_openvino
 from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import package
 
-FEWEST = 8
-"""Images needed for meaningful activation ranges."""
+FEWEST = 8  # images needed for meaningful activation ranges
 
 
 def quantise(onnx: Path, path: Path, *, info: ModelInfo, images: UInt8[np.ndarray, "n h w 3"]) -> None:
     """Quantise a float model to int8 by its activations on ``images``, with NNCF, and write it for OpenVINO.
 
     On this network OpenVINO's int8 was more than twice as fast as ONNX Runtime's static quantisation, and closer to the
-    original.
-
-    Args:
-        onnx: a float model whose graph includes the processing.
-        path: ``.xml``; the weights go into a ``.bin`` next to it.
-        info: its description.
-        images: RGB at the model's size, like those in use.
-
-    Raises:
-        ConfigError: if a package is not installed, or there are too few images.
+    original. The graph of ``onnx`` must include the processing; ``path`` ends in ``.xml``, the weights go into a
+    ``.bin``; images are RGB at the model's size. Raises ConfigError if there are too few, or a package is missing.
     """
     check_calibration(len(images))
     model = package("openvino", extra="openvino").Core().read_model(onnx)
-    with _without_telemetry():
+    with patch.dict(os.environ, CI="true"):  # keeps NNCF from reporting usage or asking to
         nncf = package("nncf", extra="openvino")
         nncf.set_log_level(logging.ERROR)
         quantised = nncf.quantize(
@@ -54,10 +43,3 @@ def check_calibration(images: int) -> None:
     """Raise ConfigError if there are too few images."""
     if images < FEWEST:
         raise ConfigError(f"calibration: {images} images are too few. Pass at least {FEWEST}, preferably 100.")
-
-
-@contextmanager
-def _without_telemetry() -> Iterator[None]:
-    """Keep NNCF from reporting usage or asking to: it does neither if CI is set."""
-    with patch.dict(os.environ, CI="true"):
-        yield

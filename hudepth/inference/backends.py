@@ -21,10 +21,8 @@ from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint
 
 BackendName = Literal["auto", "torch", "onnxruntime", "openvino"]
-EXPORTED = {".onnx": "onnxruntime", ".xml": "openvino", ".pt2": "torch"}
-"""Suffixes of exported files, and the backend that can always read each."""
-PT2 = "pt2"
-"""What ``trust`` must contain to read a .pt2 file: PyTorch unpacks parts of it in a way that can run code."""
+EXPORTED = {".onnx": "onnxruntime", ".xml": "openvino", ".pt2": "torch"}  # and what can always read each
+PT2 = "pt2"  # what trust must contain to read a .pt2 file: PyTorch unpacks parts of it in a way that can run code
 
 _NORMALISE = NormaliseBytes()
 
@@ -34,8 +32,7 @@ class Backend(Protocol):
     """A model, ready to run."""
 
     info: ModelInfo
-    name: str
-    """``torch``, ``onnxruntime`` or ``openvino``."""
+    name: str  # torch, onnxruntime or openvino
 
     def __call__(self, rgb: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
         """Return depth [m] of RGB images at the model's size."""
@@ -73,10 +70,7 @@ class TorchBackend:
     def of_checkpoint(
         cls, checkpoint: Checkpoint, *, device: torch.device, trust: list[str], size: tuple[int, int] | None = None
     ) -> TorchBackend:
-        """Return a checkpoint's network in its fastest exact form; ``size`` as in :func:`hudepth.inference.model.load`.
-
-        Raises HudepthError if the network cannot be built or does not take the size.
-        """
+        """Return a checkpoint's network in its fastest exact form; raises HudepthError if it does not take the size."""
         net = checkpoint.build_net(trust=trust)
         info = ModelInfo.of_checkpoint(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size)
         return cls(inference_form(net.to(device), size=info.size), info, device=device)
@@ -113,10 +107,8 @@ def open_exported(
     if precision != "float32" and backend != "openvino":
         raise ConfigError(f"precision={precision}: needs backend=openvino and a .onnx or .xml file.")
     if backend == "torch" and PT2 not in trust:
-        raise CheckpointError(
-            f"'{path}' is a program that could run any code when loaded. If you exported it yourself, pass "
-            f"trust=[{PT2}]; otherwise ask for an ONNX file or a bundle."
-        )
+        fix = f"If you exported it yourself, pass trust=[{PT2}]; otherwise ask for an ONNX file or a bundle."
+        raise CheckpointError(f"'{path}' is a program that could run any code when loaded. {fix}")
     try:
         if backend == "torch":
             text, compute = _open_program(path)
@@ -128,19 +120,15 @@ def open_exported(
         raise
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-        raise CheckpointError(
-            f"'{path}' cannot be read as a model: it is damaged or of another kind ({reason})."
-        ) from error
+        message = f"'{path}' cannot be read as a model: it is damaged or of another kind ({reason})."
+        raise CheckpointError(message) from error
     if not text:
-        raise CheckpointError(
-            f"'{path}' was not exported by hudepth: its size and units are unknown. Export a checkpoint with "
-            "hudepth-export."
-        )
+        why = "its size and units are unknown. Export a checkpoint with hudepth-export."
+        raise CheckpointError(f"'{path}' was not exported by hudepth: {why}")
     return GraphBackend(backend, ModelInfo.from_json(text, where=f"'{path}'"), compute)
 
 
-Opened = tuple[str, Callable[[NDArray[Any]], NDArray[Any]]]
-"""A file's description as JSON, empty if it has none, and what runs its graph."""
+Opened = tuple[str, Callable[[NDArray[Any]], NDArray[Any]]]  # description as JSON ("" if none), and what runs it
 
 
 def _open_program(path: Path) -> Opened:

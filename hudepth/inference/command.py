@@ -24,10 +24,8 @@ from hudepth.inference.model import DepthModel, ModelOptions, load_model
 from hudepth.inference.stream import Stream, Tally
 from hudepth.inference.video import FrameReader, VideoWriter
 
-IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]
-"""What is written by default."""
-PICTURES = {"colour": "_depth.mp4", "side": "_side.mp4"}
-"""Formats that become a video when the input is one, and the ending of its name."""
+IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]  # defaults
+PICTURES = {"colour": "_depth.mp4", "side": "_side.mp4"}  # formats that make a video of a video, and its ending
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +87,8 @@ def predict(config: dict[str, Any]) -> None:
     finally:
         _report(job, seconds=time.monotonic() - start)
     if failed := len(job.tally.failed):
-        raise DataError(
-            f"{failed} of {failed + job.tally.done} could not be predicted, see above; the rest is in '{output}'."
-        )
+        total = failed + job.tally.done
+        raise DataError(f"{failed} of {total} could not be predicted, see above; the rest is in '{output}'.")
 
 
 def _predict_images(job: Job, items: list[Item]) -> None:
@@ -161,17 +158,13 @@ def _report(job: Job, *, seconds: float) -> None:
     record = {
         "model": {"name": info.name, "parameters": info.parameters, "epoch": info.epoch, **info.trained_on},
         "units": {"png16": "mm", "npy": "m", "ply": "m"},
-        "network_size": list(info.size),
-        "fit": job.model.fit,
-        "max_depth_m": info.max_depth_m,
-        "backend": job.model.backend.name,
+        "network_size": list(info.size), "fit": job.model.fit,
+        "max_depth_m": info.max_depth_m, "backend": job.model.backend.name,
         "settings": {
             "input": options.input, "intrinsics": options.intrinsics, "smoothing": options.smoothing,
             "precision": options.precision, "frames": options.frames,
         },
-        "scale_m": list(job.style.scale_m),
-        "predicted": tally.done,
-        "failed": tally.failed,
+        "scale_m": list(job.style.scale_m), "predicted": tally.done, "failed": tally.failed,
     }  # fmt: skip
     try:
         write_json(job.output / "predictions.json", record)

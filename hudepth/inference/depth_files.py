@@ -20,10 +20,8 @@ from hudepth.inference.depth_map import DepthMap
 class Style:
     """What all pictures and point clouds of a run have in common."""
 
-    scale_m: tuple[float, float]
-    """Ends of the colour scale [m]."""
-    intrinsics: Intrinsics | None = None
-    """Of the camera, in pixels of the images; None: NYU's, scaled to each."""
+    scale_m: tuple[float, float]  # ends of the colour scale [m]
+    intrinsics: Intrinsics | None = None  # of the camera, in pixels of the images; None: NYU's, scaled to each
 
 
 FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] = {

@@ -24,14 +24,10 @@ FAST_PNG = (
 class DepthMap:
     """The depth of each pixel of an image."""
 
-    metres: Float[np.ndarray, "h w"]
-    """Distance along the optical axis [m], float32."""
-    image: UInt8[np.ndarray, "h w 3"]
-    """The image it was predicted from, upright, RGB."""
-    max_depth_m: float
-    """Maximum depth the model can predict [m]."""
-    notes: tuple[str, ...] = ()
-    """What reading changed in the image, if it is not obvious."""
+    metres: Float[np.ndarray, "h w"]  # distance along the optical axis [m], float32
+    image: UInt8[np.ndarray, "h w 3"]  # the image it was predicted from, upright, RGB
+    max_depth_m: float  # maximum depth the model can predict [m]
+    notes: tuple[str, ...] = ()  # what reading changed in the image, if it is not obvious
 
     def to_png16(self) -> bytes:
         """Return a 16-bit PNG file in millimetres, as NYU, ScanNet and Kinect tools use: rounded, at most 65.535 m."""

@@ -20,8 +20,7 @@ class Fitted(NamedTuple):
     """An image at the network's size."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    box: tuple[slice, slice]
-    """Rows and columns that the image fills."""
+    box: tuple[slice, slice]  # rows and columns that the image fills
 
 
 def fit_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int], *, fit: Fit, aspect: float) -> Fitted:

@@ -18,8 +18,7 @@ class Item(NamedTuple):
     """A file to predict, and the name of its results."""
 
     path: Path
-    stem: Path
-    """Relative to the output folder, without an ending."""
+    stem: Path  # relative to the output folder, without an ending
 
 
 class Inputs(NamedTuple):

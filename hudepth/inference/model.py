@@ -138,7 +138,6 @@ def load(
 def load_model(chosen: ModelOptions) -> DepthModel:
     """Load the model that the options name; raises as :func:`load` does."""
     path, threads = Path(chosen.checkpoint).expanduser(), chosen.threads or usable_cores()
-    backend: Backend
     if path.suffix.lower() in EXPORTED and not path.is_dir():
         if chosen.size is not None:
             raise ConfigError(f"size: '{path.name}' has a fixed size. Leave size out.")
@@ -146,10 +145,10 @@ def load_model(chosen: ModelOptions) -> DepthModel:
             wanted = "a checkpoint, run directory, bundle or exported file"
             raise ConfigError(f"checkpoint: no file '{path}'. Pass {wanted}.")
         torch.set_num_threads(threads)
-        backend = open_exported(
+        graph = open_exported(
             path, backend=chosen.backend, threads=threads, trust=chosen.trust, precision=chosen.precision
         )
-        return DepthModel(backend, fit=chosen.fit, flip=chosen.flip)
+        return DepthModel(graph, fit=chosen.fit, flip=chosen.flip)
     for key, usable in (("backend", ("auto", "torch")), ("precision", ("float32",))):
         if (value := getattr(chosen, key)) not in usable:
             run = f"hudepth-export checkpoint={chosen.checkpoint} format=openvino"

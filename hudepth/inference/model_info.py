@@ -5,40 +5,31 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import Range, parse
 from hudepth.runs.checkpoint import Checkpoint
 
-VERSION = 1
-"""Of the description; exported files carry it as JSON under the key :data:`KEY`."""
+VERSION = 1  # of the description; exported files carry it as JSON under KEY
 KEY = "hudepth"
-USUAL_ASPECT = 4 / 3
-"""Width over height of training images if a checkpoint does not record it: that of NYU Depth V2 and most sensors."""
-MAX_SIDE = 8192
-"""Descriptions that ask for larger images are refused."""
+USUAL_ASPECT = 4 / 3  # width over height if a checkpoint does not record it: that of NYU Depth V2 and most sensors
+MAX_SIDE = 8192  # descriptions that ask for larger images are refused
 
 
 @dataclass(frozen=True)
 class ModelInfo:
     """What is known about a model."""
 
-    name: str
-    """Class of the network, for example ``HybridUNet``."""
-    size: Annotated[tuple[int, int], Range(1, MAX_SIDE)]
-    """(height, width) of the images the network takes."""
+    name: str  # class of the network, for example HybridUNet
+    size: Annotated[tuple[int, int], Range(1, MAX_SIDE)]  # (height, width) of the images the network takes
     max_depth_m: Annotated[float, Range(0, 1e6, above=True)]
     """Maximum depth [m]; the network predicts depth / max_depth_m."""
     parameters: int
-    epoch: int
-    """Finished epochs of training."""
-    trained_on: dict[str, Any] = field(default_factory=dict)
-    """Source, fingerprint, encoding and split of the training data."""
-    aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT
-    """Width over height of the training images before they were resized."""
-    processing: bool = True
-    """Whether an exported graph maps RGB bytes to metres; otherwise normalised images to unit depth."""
+    epoch: int  # finished epochs of training
+    trained_on: dict[str, Any] = field(default_factory=dict)  # source, fingerprint, encoding and split of the data
+    aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT  # width over height of the original training images
+    processing: bool = True  # whether a graph maps RGB bytes to metres, else normalised images to unit depth
 
     def __str__(self) -> str:
         source, size = self.trained_on.get("source") or "unknown data", f"{self.size[0]} x {self.size[1]}"
@@ -58,19 +49,13 @@ class ModelInfo:
                 raise ValueError("unknown version")
             info = parse(cls, content)
         except (ValueError, RecursionError, ConfigError) as error:
-            raise CheckpointError(
-                f"{where}: its model description cannot be read ({error}). Export it again with hudepth-export."
-            ) from error
+            message = f"its model description cannot be read ({error}). Export it again with hudepth-export."
+            raise CheckpointError(f"{where}: {message}") from error
         return replace(info, name=info.name[:100])
 
     @classmethod
-    def of_checkpoint(
-        cls, checkpoint: Checkpoint, *, parameters: int, size: tuple[int, int] | None = None
-    ) -> ModelInfo:
-        """Describe a checkpoint, at the input size of its training unless another is given.
-
-        Raises CheckpointError if it does not record its training data.
-        """
+    def of_checkpoint(cls, checkpoint: Checkpoint, *, parameters: int, size: tuple[int, int] | None = None) -> Self:
+        """Describe a checkpoint, by default at its training's size; raises CheckpointError if it records no data."""
         data: Any = checkpoint.config.get("data")
         try:
             height, width = size or data["size"]

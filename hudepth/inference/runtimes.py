@@ -8,15 +8,11 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError
 
-PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
-"""Precisions of OpenVINO, and its own names for them; bfloat16 is not exact."""
+PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}  # and OpenVINO's names for them; bfloat16 is not exact
 
 
 def onnx_session(path: Path, *, threads: int) -> Any:
-    """Open an ONNX file in ONNX Runtime, on the CPU.
-
-    Raises ConfigError if ONNX Runtime is not installed, and whatever it raises for a file that it cannot read.
-    """
+    """Open an ONNX file on the CPU; raises ConfigError if ONNX Runtime is missing, and what that raises itself."""
     runtime = package("onnxruntime", extra="onnx")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = threads

@@ -17,8 +17,7 @@ from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel, Picture, Prepared
 
 Key = TypeVar("Key")
-LOT = 8
-"""Images per thread that are decoded, predicted and written together: few enough for memory."""
+LOT = 8  # images per thread that are decoded, predicted and written together: few enough for memory
 
 
 @dataclass
@@ -26,10 +25,8 @@ class Tally:
     """The results of a stream."""
 
     done: int = 0
-    failed: dict[str, str] = field(default_factory=dict)
-    """Images that could not be read, and why."""
-    notes: dict[str, str] = field(default_factory=dict)
-    """Remarks on images that were predicted."""
+    failed: dict[str, str] = field(default_factory=dict)  # images that could not be read, and why
+    notes: dict[str, str] = field(default_factory=dict)  # remarks on images that were predicted
 
 
 @dataclass
@@ -42,16 +39,12 @@ class Stream(Generic[Key]):
     """
 
     model: DepthModel
-    write: Callable[[Key, DepthMap], None]
-    """Called in a thread with each image's key and depth."""
+    write: Callable[[Key, DepthMap], None]  # called in a thread with each image's key and depth
     tally: Tally = field(kw_only=True)
     batch_size: int = field(default=1, kw_only=True)
-    workers: int = field(default=2, kw_only=True)
-    """Threads that decode and write; one keeps the order."""
-    overlap: bool = field(default=False, kw_only=True)
-    """Whether they work while the network computes."""
-    smoothing: float = field(default=0.0, kw_only=True)
-    """Of consecutive frames: the weight of the previous depth, from 0 (none) to less than 1."""
+    workers: int = field(default=2, kw_only=True)  # threads that decode and write; one keeps the order
+    overlap: bool = field(default=False, kw_only=True)  # whether they work while the network computes
+    smoothing: float = field(default=0.0, kw_only=True)  # weight of the previous frame's depth, in [0, 1)
     _previous: Float[np.ndarray, "h w"] | None = field(default=None, init=False)
 
     def run(self, pictures: Iterable[tuple[Key, Picture]]) -> Iterator[Key]:

@@ -17,10 +17,8 @@ from hudepth.base.images import check_pixels
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
-DEFAULT_RATE = 25.0
-"""Frames per second where a source does not state its rate."""
-CODEC = "mp4v"
-"""MPEG-4 part 2, which every build of OpenCV can write."""
+DEFAULT_RATE = 25.0  # frames per second where a source does not state its rate
+CODEC = "mp4v"  # MPEG-4 part 2, which every build of OpenCV can write
 
 
 class FrameReader:
@@ -43,9 +41,8 @@ class FrameReader:
         check_pixels(height, width, where=self.name)
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self.rate = rate if 0 < rate < 1000 else DEFAULT_RATE  # frames per second
-        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)  # as the file states; a camera does not
         self.expected = int(count) if not isinstance(source, int) and 0 < count < 1e9 else None
-        """Number of frames that the file states; None for a camera."""
         self.read = 0
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
