@@ -18,8 +18,8 @@ from hudepth.demo.session_files import Files
 from hudepth.inference.model_info import ModelInfo
 
 FONTS = ["ui-sans-serif", "system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "Arial", "sans-serif"]
-MONO = ["ui-monospace", "Menlo", "Consolas", "monospace"]
-"""Common system fonts; gradio's own themes would load others from the web."""
+MONO = ["ui-monospace", "Menlo", "Consolas", "monospace"]  # system fonts; gradio's themes load others from the web
+THEME = gr.themes.Default(primary_hue="blue", font=FONTS, font_mono=MONO)
 BUTTONS = ("PNG16 (mm)", "npy (m)", "PLY (m)")
 KEEP_S = (600, 3600)  # how often gradio deletes files that no session owns, and their maximum age [s]
 
@@ -42,7 +42,10 @@ def build(
                 rooms = [[str(path)] for path in examples]
                 gr.Examples(rooms, [image], label="Examples: rendered rooms", elem_id="rooms")
             with gr.Column(scale=5, min_width=320):
-                viewer = _viewer()
+                html, script = data_file("viewer.html"), data_file("points.js") + data_file("viewer.js")
+                colours = base64.b64encode(colour_table().tobytes()).decode()
+                style: dict[str, Any] = {"apply_default_css": False, "elem_id": "viewer"}
+                viewer = gr.HTML(None, html_template=html, js_on_load=script, colours=colours, **style)
                 with gr.Row(elem_id="downloads"):
                     off: dict[str, Any] = {"interactive": False, "size": "md", "min_width": 80}
                     buttons = [gr.DownloadButton(label, **off) for label in BUTTONS]
@@ -88,13 +91,6 @@ def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., It
     return show
 
 
-def _viewer() -> gr.HTML:
-    colours = base64.b64encode(colour_table().tobytes()).decode()
-    html, script = data_file("viewer.html"), data_file("points.js") + data_file("viewer.js")
-    style: dict[str, Any] = {"apply_default_css": False, "elem_id": "viewer"}
-    return gr.HTML(None, html_template=html, js_on_load=script, colours=colours, **style)
-
-
 def headline(info: ModelInfo, camera: str) -> str:
     """Return the headline: which model this is, and how far to trust its numbers."""
     return (
@@ -102,11 +98,6 @@ def headline(info: ModelInfo, camera: str) -> str:
         f"{escape(str(info))}. Camera of the point cloud: {escape(camera)}. "
         "Do not trust the metres in pictures unlike the training data.</p></div>"
     )
-
-
-def theme() -> gr.Theme:
-    """Return gradio's default theme with system fonts."""
-    return gr.themes.Default(primary_hue="blue", font=FONTS, font_mono=MONO)
 
 
 def data_file(name: str) -> str:

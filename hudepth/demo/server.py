@@ -103,7 +103,7 @@ def serve(
             _, address, _ = blocks.launch(
                 server_name=host, server_port=port, share=False, inbrowser=False, prevent_thread_lock=True, quiet=True,
                 show_error=True, max_file_size=limits.upload_bytes, ssr_mode=False, mcp_server=False, pwa=False,
-                enable_monitoring=False, run_history=False, footer_links=[], theme=page.theme(),
+                enable_monitoring=False, run_history=False, footer_links=[], theme=page.THEME,
                 css=page.data_file("viewer.css"), app_kwargs={"middleware": [Middleware(Policy)]},
             )  # fmt: skip
             ready(address.rstrip("/"))

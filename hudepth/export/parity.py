@@ -40,7 +40,6 @@ def compare(
 def check(parity: Parity, *, what: str, tolerance_mm: float) -> None:
     """Raise CheckpointError if the difference exceeds the tolerance."""
     if not parity.worst_mm <= tolerance_mm:
-        raise CheckpointError(
-            f"{what}: {parity.worst_mm:.3g} mm from the checkpoint at the worst pixel, the limit is {tolerance_mm:g}. "
-            f"The file was not kept; pass tolerance_mm={parity.worst_mm * 1.1:.2g} to accept it."
-        )
+        found = f"{parity.worst_mm:.3g} mm from the checkpoint at the worst pixel, the limit is {tolerance_mm:g}"
+        fix = f"The file was not kept; pass tolerance_mm={parity.worst_mm * 1.1:.2g} to accept it."
+        raise CheckpointError(f"{what}: {found}. {fix}")

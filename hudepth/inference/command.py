@@ -80,10 +80,8 @@ def predict(config: dict[str, Any]) -> None:
         if inputs.camera is not None:
             _predict_frames(job, inputs.camera, output / f"camera{inputs.camera}", CAMERA_FORMATS)
     except OSError as error:
-        raise ConfigError(
-            f"output: cannot write to '{output}' ({error.strerror or error}); {job.tally.done} were predicted. "
-            "Free some space or pass another output=<folder>."
-        ) from error
+        rest = f"{job.tally.done} were predicted. Free some space or pass another output=<folder>."
+        raise ConfigError(f"output: cannot write to '{output}' ({error.strerror or error}); {rest}") from error
     finally:
         _report(job, seconds=time.monotonic() - start)
     if failed := len(job.tally.failed):

@@ -38,8 +38,7 @@ class DepthMap:
     ) -> UInt8[np.ndarray, "h w2 3"]:
         """Return depth as RGB colours, near red and far blue, with a legend in metres.
 
-        ``scale_m`` gives the depths at the ends of the scale (default: 0 to ``max_depth_m``); raises ConfigError if
-        they are not two rising numbers.
+        The scale is 0 to ``max_depth_m`` [m] by default; raises ConfigError if its ends are not two rising numbers.
         """
         return colour_depth(self.metres, scale_m=scale_m or (0.0, self.max_depth_m), legend=legend)
 
@@ -50,8 +49,7 @@ class DepthMap:
     def point_cloud(self, intrinsics: Intrinsics | tuple[float, float, float, float] | None = None) -> PointCloud:
         """Return one coloured point per pixel.
 
-        ``intrinsics`` are fx, fy, cx, cy of the camera [pixels of the image] (default: NYU's, scaled to the image);
-        raises ConfigError if they are not those of a camera.
+        ``intrinsics`` (fx, fy, cx, cy) are in pixels, by default NYU's, scaled; raises ConfigError if they are invalid.
         """
         camera = Intrinsics(*intrinsics) if isinstance(intrinsics, tuple) else intrinsics
         return point_cloud(self.metres, self.image, camera)

@@ -22,10 +22,7 @@ CODEC = "mp4v"  # MPEG-4 part 2, which every build of OpenCV can write
 
 
 class FrameReader:
-    """Frames of a video file or of the camera of a number, upright RGB, one at a time.
-
-    Raises DataError if it cannot be opened, or its frames are too large.
-    """
+    """Upright RGB frames of a video file or of a numbered camera; raises DataError if not readable or too large."""
 
     def __init__(self, source: Path | int) -> None:
         self.name = f"camera {source}" if isinstance(source, int) else f"'{source}'"
