@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import Range, parse
@@ -54,7 +54,9 @@ class ModelInfo:
         return replace(info, name=info.name[:100])
 
     @classmethod
-    def of_checkpoint(cls, checkpoint: Checkpoint, *, parameters: int, size: tuple[int, int] | None = None) -> Self:
+    def of_checkpoint(
+        cls, checkpoint: Checkpoint, *, parameters: int, size: tuple[int, int] | None = None
+    ) -> ModelInfo:
         """Describe a checkpoint, by default at its training's size; raises CheckpointError if it records no data."""
         data: Any = checkpoint.config.get("data")
         try:

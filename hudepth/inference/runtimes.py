@@ -21,10 +21,7 @@ def onnx_session(path: Path, *, threads: int) -> Any:
 
 
 def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:
-    """Open an IR (``.xml`` next to its ``.bin``) or ONNX file in OpenVINO: the model as read, and an inference request.
-
-    Raises ConfigError if OpenVINO is not installed, and whatever it raises for a file that it cannot read.
-    """
+    """Open an IR or ONNX file in OpenVINO: the model as read, and an inference request; raises as onnx_session does."""
     core = package("openvino", extra="openvino").Core()
     options = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision], "INFERENCE_NUM_THREADS": threads}
     options["PERFORMANCE_HINT"] = "LATENCY"
