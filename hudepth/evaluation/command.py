@@ -29,13 +29,12 @@ class CommandOptions(ScoreOptions):
 
 
 def test(config: dict[str, Any]) -> None:
-    """Score a checkpoint and write ``test/<protocol>/`` of its run directory.
+    """Score a checkpoint and write ``test/<protocol>/`` of its run directory. Raises HudepthError with one line for the
+    user.
+
 
     Args:
         config: conf/test.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user.
     """
     options = parse(CommandOptions, config)
     checkpoint = load_checkpoint(options.checkpoint, runs=options.paths["runs"])

@@ -18,10 +18,8 @@ BEFORE = "before"
 
 
 def lineage(checkpoint: Checkpoint) -> list[dict[str, Any]]:
-    """Return what a checkpoint was trained on (data and split), then what the networks it started from were.
-
-    Raises:
-        CheckpointError: if the checkpoint does not state it in a known form.
+    """Return what a checkpoint was trained on (data and split), then what the networks it started from were. Raises
+    CheckpointError if the checkpoint does not state it in a known form.
     """
     own = {key: value for key, value in checkpoint.data.items() if key != BEFORE}
     before = checkpoint.data.get(BEFORE, [])
@@ -39,15 +37,14 @@ def read_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | N
 def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *, subsets: tuple[str, ...]) -> None:
     """Refuse a split that evaluates a network on pairs it has seen.
 
-    A test must not contain validation pairs either: the best epoch was chosen on them.
+    A test must not contain validation pairs either: the best epoch was chosen on them. Raises DataError if a pair is in
+    both.
+
 
     Args:
         checkpoint: the network, or what it starts from.
         datamodule: with the split.
         subsets: the subsets that evaluate the network.
-
-    Raises:
-        DataError: if a pair is in both.
     """
     for number, past in enumerate(lineage(checkpoint)):
         if past.get("fingerprint") != datamodule.store.info["fingerprint"]:

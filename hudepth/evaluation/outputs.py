@@ -28,7 +28,9 @@ Metrics = dict[str, dict[str, float]]
 def write_outputs(
     folder: Path, protocol: Protocol, evaluation: Evaluation, datamodule: DepthDataModule, stamp: Mapping[str, Any]
 ) -> Metrics:
-    """Summarise, write and print the results of one protocol.
+    """Summarise, write and print the results of one protocol. Raises ConfigError if the protocol counts no pixel of any
+    image.
+
 
     Args:
         folder: to write to.
@@ -36,9 +38,6 @@ def write_outputs(
         evaluation: finished.
         datamodule: whose test subset was scored.
         stamp: what else metrics.json states: data, split, checkpoint.
-
-    Raises:
-        ConfigError: if the protocol counts no pixel of any image.
     """
     tables = _image_tables(protocol, evaluation, datamodule)
     model = tables[MODEL]

@@ -24,15 +24,14 @@ from hudepth.viz.panels import Panel
 def run_panels(
     run: Path, choose: Callable[[DepthDataModule], Sequence[int]], *, config: Mapping[str, Any]
 ) -> list[Panel]:
-    """Predict pairs of a run's data with its best checkpoint.
+    """Predict pairs of a run's data with its best checkpoint. Raises HudepthError if the checkpoint or its data is
+    missing or has changed.
+
 
     Args:
         run: the run directory.
         choose: returns the positions of the pairs in the depth store.
         config: with ``paths``, ``data`` (overrides of the checkpoint's) and ``trust``.
-
-    Raises:
-        HudepthError: if the checkpoint or its data is missing or has changed.
     """
     checkpoint = load_checkpoint(str(run))
     typed = {"cache": config["paths"]["cache"], **config["data"]}
@@ -42,15 +41,14 @@ def run_panels(
 
 
 def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mapping[str, Any]) -> list[Panel]:
-    """Predict the same images with several runs; return one panel per image and run, titled with the run's name.
+    """Predict the same images with several runs; return one panel per image and run, titled with the run's name. Raises
+    HudepthError as :func:`run_panels`, or if a run's data lacks an image.
+
 
     Args:
         runs: run directories by name.
         ids: of the images.
         config: as for :func:`run_panels`.
-
-    Raises:
-        HudepthError: as :func:`run_panels`, or if a run's data lacks an image.
     """
 
     def positions(datamodule: DepthDataModule) -> list[int]:

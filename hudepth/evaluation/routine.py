@@ -17,16 +17,15 @@ from hudepth.metrics.protocol import Protocol
 
 
 class Evaluation(LightningModule):
-    """Collects one row of sums per image for each predictor and protocol. Run it with ``Trainer.test``.
+    """Collects one row of sums per image for each predictor and protocol. Run it with ``Trainer.test``. Raises
+    ConfigError if two protocols have the same name.
+
 
     Args:
         predictors: by name; normalised image to unit depth.
         protocols: how to score.
         max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
         detailed: the predictor whose boundaries and strata are measured too, if a protocol asks for them.
-
-    Raises:
-        ConfigError: if two protocols have the same name.
     """
 
     def __init__(

@@ -48,7 +48,9 @@ class ScoreOptions:
 def score_checkpoint(
     checkpoint: Checkpoint, options: ScoreOptions, *, output: Path, datamodule: DepthDataModule
 ) -> dict[str, Metrics]:
-    """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol.
+    """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol. Raises
+    HudepthError with one line for the user.
+
 
     Args:
         checkpoint: what to score.
@@ -59,9 +61,6 @@ def score_checkpoint(
 
     Returns:
         Metrics by protocol, predictor and name; empty except in the first process.
-
-    Raises:
-        HudepthError: with one line for the user.
     """
     import_trusted(options.trust)
     protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
@@ -91,15 +90,14 @@ def score_checkpoint(
 
 
 def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options: Mapping[str, Any]) -> bool:
-    """Run an evaluation over the test subset; return whether this is the first process, which has the results.
+    """Run an evaluation over the test subset; return whether this is the first process, which has the results. Raises
+    ConfigError if the devices are not available.
+
 
     Args:
         evaluation: what to run.
         datamodule: with the test subset.
         options: arguments of Lightning's Trainer; one device by default.
-
-    Raises:
-        ConfigError: if the devices are not available.
     """
     with without_known_warnings():
         trainer = build_trainer(

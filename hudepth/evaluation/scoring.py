@@ -34,10 +34,8 @@ class BatchTruth:
         self._cache = Cache()
 
     def grids(self, protocol: Protocol) -> list[Grid]:
-        """Return one grid at network resolution, or one for each image at its native resolution.
-
-        Raises:
-            ConfigError: if the protocol needs native ground truth and the batch has none.
+        """Return one grid at network resolution, or one for each image at its native resolution. Raises ConfigError if
+        the protocol needs native ground truth and the batch has none.
         """
         return self._cache.get(protocol.needs_native, lambda: self._grids(protocol))
 

@@ -16,7 +16,9 @@ from hudepth.runs.checkpoint import Checkpoint
 def open_data(
     checkpoint: Checkpoint, overrides: Mapping[str, Any], *, typed: Sequence[str] = (), trust: list[str]
 ) -> tuple[DepthDataModule, bool]:
-    """Return the data to test a checkpoint on, with the split it was trained with, or another data set.
+    """Return the data to test a checkpoint on, with the split it was trained with, or another data set. Raises
+    HudepthError if it cannot be built, or if test pairs were trained on.
+
 
     Args:
         checkpoint: states what it was trained on.
@@ -27,9 +29,6 @@ def open_data(
 
     Returns:
         The data, and whether data set or split differ from those of the training.
-
-    Raises:
-        HudepthError: if it cannot be built, or if test pairs were trained on.
     """
     datamodule = build_data(_data_config(checkpoint, overrides, typed), trust=trust)
     other_data = "_target_" in overrides or any(key.startswith(("split", "fractions")) for key in overrides)

@@ -29,13 +29,11 @@ MAX_WEIGHTS_BYTES = 1 << 32
 
 
 def pretrained(name: str) -> Path:
-    """Return the folder of a bundled pretrained model.
+    """Return the folder of a bundled pretrained model. Raises CheckpointError if this installation lacks it.
+
 
     Args:
         name: one of :data:`PRETRAINED`.
-
-    Raises:
-        CheckpointError: if this installation lacks it.
     """
     spec = find_spec("hudepth.pretrained")
     folders = list(spec.submodule_search_locations or []) if spec else []
@@ -56,16 +54,15 @@ def is_bundle(path: Path) -> bool:
 
 
 def read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Any], int]:
-    """Read a bundle; nothing is unpacked to the disk, and nothing in it can run code.
+    """Read a bundle; nothing is unpacked to the disk, and nothing in it can run code. Raises CheckpointError if it is
+    damaged, too large, holds paths outside its folder, or is not a bundle.
+
 
     Args:
         path: a folder, its ``model.safetensors``, or a zip of the folder.
 
     Returns:
         Its configuration, its tensors, and the number of bytes they were read from.
-
-    Raises:
-        CheckpointError: if it is damaged, too large, holds paths outside its folder, or is not a bundle.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load

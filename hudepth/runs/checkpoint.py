@@ -29,10 +29,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes to a temporary file, then renames it: a full disk or a kill never costs the previous checkpoint."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write ``checkpoint`` to ``path``, whole or not at all.
-
-        Raises:
-            TrainingError: if the disk is full or the folder cannot be written; the previous checkpoint is intact.
+        """Write ``checkpoint`` to ``path``, whole or not at all. Raises TrainingError if the disk is full or the folder
+        cannot be written; the previous checkpoint is intact.
         """
         try:
             with written_whole(Path(path)) as part:
@@ -72,14 +70,13 @@ class Checkpoint:
         """Return the network in evaluation mode.
 
         It is first built on the meta device and compared with the checkpoint's tensors, so that a configuration that
-        asks for more than the file holds cannot exhaust memory. Trusted code is built once, without this check.
+        asks for more than the file holds cannot exhaust memory. Trusted code is built once, without this check. Raises
+        CheckpointError if the tensors do not fit the configured network; ConfigError if the configuration names an
+        untrusted class, or one that is not a network.
+
 
         Args:
             trust: further modules whose classes the configuration may name.
-
-        Raises:
-            CheckpointError: if the tensors do not fit the configured network.
-            ConfigError: if the configuration names an untrusted class, or one that is not a network.
         """
         model = dict(self.config["model"])
         if "weights" in model:
@@ -95,11 +92,7 @@ class Checkpoint:
         return net.eval()
 
     def fill(self, net: nn.Module) -> None:
-        """Load the tensors into a network.
-
-        Raises:
-            CheckpointError: if they do not fit.
-        """
+        """Load the tensors into a network. Raises CheckpointError if they do not fit."""
         self._check_fits(net)
         net.load_state_dict(self.state)
 
@@ -116,15 +109,13 @@ class Checkpoint:
 
 
 def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
-    """Return the file or folder that ``spec`` refers to.
+    """Return the file or folder that ``spec`` refers to. Raises CheckpointError if there is no such file.
+
 
     Args:
         spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or
             one of :data:`hudepth.runs.bundles.PRETRAINED`.
         runs: where ``last`` looks.
-
-    Raises:
-        CheckpointError: if there is no such file.
     """
     if spec in bundles.PRETRAINED:
         return bundles.pretrained(spec)
@@ -143,10 +134,8 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
 
 
 def read_plain(path: Path) -> dict[str, Any]:
-    """Read a file of plain types; files with anything else are refused without running code.
-
-    Raises:
-        CheckpointError: if the file is damaged, holds code, or unpacks to more than its own size.
+    """Read a file of plain types; files with anything else are refused without running code. Raises CheckpointError if
+    the file is damaged, holds code, or unpacks to more than its own size.
     """
     _check_archive(path)
     try:
@@ -185,14 +174,13 @@ def _damaged(path: Path, error: Exception) -> CheckpointError:
 
 
 def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
-    """Find and read a checkpoint.
+    """Find and read a checkpoint. Raises CheckpointError if it is missing, damaged, holds code, or was not written by
+    hudepth.
+
 
     Args:
         spec: a file, a run directory, or ``last``.
         runs: where ``last`` looks.
-
-    Raises:
-        CheckpointError: if it is missing, damaged, holds code, or was not written by hudepth.
     """
     path = find_checkpoint(spec, runs=runs)
     if bundles.is_bundle(path):

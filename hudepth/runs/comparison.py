@@ -54,10 +54,8 @@ def _format(value: Any) -> str:
 def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
     """Return the images of two results, in the order of the first.
 
-    The splits may differ in their training pairs, as long as the test images are the same.
-
-    Raises:
-        DataError: if protocol, data or images differ; the message suggests a fix.
+    The splits may differ in their training pairs, as long as the test images are the same. Raises DataError if
+    protocol, data or images differ; the message suggests a fix.
     """
     where = _check_conditions(a, b)
     first, second = _take_common(a.table, b.table)
@@ -76,10 +74,8 @@ def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
 
 
 def common_images(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
-    """Return the images that are in both results, in the order of the first; for two splits of one data set.
-
-    Raises:
-        DataError: if protocol or data differ, or if they share no image.
+    """Return the images that are in both results, in the order of the first; for two splits of one data set. Raises
+    DataError if protocol or data differ, or if they share no image.
     """
     where = _check_conditions(a, b)
     tables = _take_common(a.table, b.table)
@@ -123,16 +119,15 @@ def _take(table: ImageTable, rows: Sequence[int]) -> ImageTable:
 
 
 def merge(results: Mapping[str, Result], *, metrics: Sequence[str], mark: bool = False) -> list[dict[str, str | float]]:
-    """Return the rows of a table, one per result: ``name``, then the metrics of its network.
+    """Return the rows of a table, one per result: ``name``, then the metrics of its network. Raises DataError if they
+    differ and ``mark`` is not set, or if no result has a metric.
+
 
     Args:
         results: by the name of their row.
         metrics: columns; NaN where a result lacks one.
         mark: where protocols, data or splits differ, add the columns ``protocol``, ``data`` and ``split`` as needed
             to tell the rows apart, instead of raising.
-
-    Raises:
-        DataError: if they differ and ``mark`` is not set, or if no result has a metric.
     """
     known = {name for result in results.values() for name in result.metrics}
     for name in metrics:

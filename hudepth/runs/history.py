@@ -26,11 +26,7 @@ def write_history(path: Path, rows: Sequence[Mapping[str, float]]) -> None:
 
 
 def read_history(path: Path) -> list[dict[str, float]]:
-    """Read a run's metrics.csv: one row per epoch.
-
-    Raises:
-        DataError: if it is missing or holds no epoch.
-    """
+    """Read a run's metrics.csv: one row per epoch. Raises DataError if it is missing or holds no epoch."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             rows = [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]

@@ -71,15 +71,13 @@ class Result:
 
 
 def find_result(run_or_folder: str | Path, protocol: str) -> Result:
-    """Read a test result.
+    """Read a test result. Raises DataError if there is none, or if its files are damaged or do not belong together.
+
 
     Args:
         run_or_folder: a run directory, the folder of a study, their folder ``test`` (or another ``output=`` of
             hudepth-test), or the folder of the protocol itself.
         protocol: its name.
-
-    Raises:
-        DataError: if there is none, or if its files are damaged or do not belong together.
     """
     folder = Path(run_or_folder).expanduser()
     if not folder.is_dir():
@@ -103,11 +101,7 @@ def find_result(run_or_folder: str | Path, protocol: str) -> Result:
 
 
 def read_metrics(file: Path) -> dict[str, Any]:
-    """Read a metrics.json, which has at least metrics of the network.
-
-    Raises:
-        DataError: if it is missing or damaged.
-    """
+    """Read a metrics.json, which has at least metrics of the network. Raises DataError if it is missing or damaged."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

@@ -36,11 +36,7 @@ class Run:
 
     @classmethod
     def read(cls, path: Path, *, labels: Mapping[str, str] | None = None) -> Run:
-        """Read a run directory.
-
-        Raises:
-            CheckpointError: if it is not one.
-        """
+        """Read a run directory. Raises CheckpointError if it is not one."""
         config = read_config(path)
         missing = [part for part in ("seed", "data", "model", "loss") if part not in config]
         if missing:
@@ -80,11 +76,7 @@ def is_run(path: Path) -> bool:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read a run's config.yaml as plain Python.
-
-    Raises:
-        CheckpointError: if it is missing or damaged.
-    """
+    """Read a run's config.yaml as plain Python. Raises CheckpointError if it is missing or damaged."""
     try:
         config = read_yaml(path / "config.yaml")
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -96,10 +88,8 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def newest_run(runs: str | Path) -> Path:
-    """Return the run below ``runs`` that was written to last and has a checkpoint.
-
-    Raises:
-        CheckpointError: if there is none.
+    """Return the run below ``runs`` that was written to last and has a checkpoint. Raises CheckpointError if there is
+    none.
     """
     root = Path(runs).expanduser()
     found = [c.parent.parent for name in (BEST, LAST) for c in root.glob(f"*/*/{CHECKPOINTS}/{name}")]

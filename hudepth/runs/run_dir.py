@@ -31,10 +31,8 @@ SCORED = "scored.json"
 
 
 def create(parent: str | Path, name: str) -> Path:
-    """Make ``<parent>/<name>/<date_time>``; a second run within the same second gets a number appended.
-
-    Raises:
-        ConfigError: if the folder cannot be made.
+    """Make ``<parent>/<name>/<date_time>``; a second run within the same second gets a number appended. Raises
+    ConfigError if the folder cannot be made.
     """
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     base = Path(parent).expanduser() / name
@@ -55,10 +53,8 @@ def create(parent: str | Path, name: str) -> Path:
 def write_start(
     run: Path, *, config: Mapping[str, Any], overrides: Sequence[str], environment: Mapping[str, Any]
 ) -> None:
-    """Write what is known before a run begins: config.yaml, overrides.txt, environment.json.
-
-    Raises:
-        ConfigError: if the folder cannot be written.
+    """Write what is known before a run begins: config.yaml, overrides.txt, environment.json. Raises ConfigError if the
+    folder cannot be written.
     """
     try:
         _write_config(run, config, overrides)
@@ -70,10 +66,8 @@ def write_start(
 
 
 def write_resumed(run: Path, *, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Write the configuration of a resumed run, and append its overrides to overrides.txt.
-
-    Raises:
-        ConfigError: if the folder cannot be written.
+    """Write the configuration of a resumed run, and append its overrides to overrides.txt. Raises ConfigError if the
+    folder cannot be written.
     """
     file = run / "overrides.txt"
     try:
@@ -107,7 +101,9 @@ def log_to_file(path: Path) -> Iterator[None]:
 def note_scored(run: Path, *, epoch: int, data: str, split: str, protocols: Sequence[str]) -> list[int]:
     """Record in scored.json that a run's network was evaluated on test images.
 
-    Choosing among several results on test images makes the best one biased, so every evaluation is recorded.
+    Choosing among several results on test images makes the best one biased, so every evaluation is recorded. Raises
+    OSError if the file cannot be written.
+
 
     Args:
         run: the run directory.
@@ -118,9 +114,6 @@ def note_scored(run: Path, *, epoch: int, data: str, split: str, protocols: Sequ
 
     Returns:
         Epochs of the run's other checkpoints that were evaluated on these test images before.
-
-    Raises:
-        OSError: if the file cannot be written.
     """
     earlier = read_scored(run)
     now = datetime.now(UTC).isoformat(timespec="seconds")

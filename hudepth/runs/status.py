@@ -67,15 +67,13 @@ def _is_locked(run: Path) -> bool:
 
 @contextmanager
 def lock_run(run: Path, *, timeout_s: float = 0) -> Iterator[None]:
-    """Keep other processes from working in a run directory during the block; a killed process releases its lock.
+    """Keep other processes from working in a run directory during the block; a killed process releases its lock. Raises
+    LockedError if another process still holds it; ConfigError if the folder cannot be written.
+
 
     Args:
         run: the run directory.
         timeout_s: how long to wait for another process to release it.
-
-    Raises:
-        LockedError: if another process still holds it.
-        ConfigError: if the folder cannot be written.
     """
     lock = FileLock(run / LOCK)
     try:

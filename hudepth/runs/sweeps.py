@@ -49,14 +49,13 @@ class Sweep:
 
 
 def read_sweep(folder: str | Path, *, name: str | None = None) -> Sweep:
-    """Read a sweep's folder, with or without sweep.yaml; folders that are not runs are skipped, with a note.
+    """Read a sweep's folder, with or without sweep.yaml; folders that are not runs are skipped, with a note. Raises
+    DataError if there is no such folder, run or sweep.
+
 
     Args:
         folder: the sweep's.
         name: one of the sweeps that were run in it; default: all.
-
-    Raises:
-        DataError: if there is no such folder, run or sweep.
     """
     root = Path(folder).expanduser()
     if not root.is_dir():
@@ -100,11 +99,7 @@ def _select_jobs(root: Path, name: str | None, notes: list[str]) -> list[dict[st
 
 
 def read_jobs(folder: Path) -> Jobs:
-    """Read sweep.yaml; empty if there is none.
-
-    Raises:
-        DataError: if it is damaged.
-    """
+    """Read sweep.yaml; empty if there is none. Raises DataError if it is damaged."""
     path = folder / SWEEP_FILE
     if not path.is_file():
         return {}
@@ -131,10 +126,7 @@ def _outcome(job: Mapping[str, Any]) -> dict[str, str]:
 def write_jobs(folder: Path, name: str, jobs: Sequence[Mapping[str, Any]]) -> None:
     """Add the jobs of a sweep to sweep.yaml; jobs already listed stay, in their order.
 
-    A job that could not be composed is replaced when it is tried again.
-
-    Raises:
-        OSError: if the file cannot be written.
+    A job that could not be composed is replaced when it is tried again. Raises OSError if the file cannot be written.
     """
     try:
         sweeps = read_jobs(folder)

@@ -33,7 +33,9 @@ def colour_map(name: str) -> Colormap:
 def colour_depth(
     depth_m: Float[np.ndarray, "h w"], *, scale_m: tuple[float, float], legend: bool = True
 ) -> UInt8[np.ndarray, "h w2 3"]:
-    """Paint depth on a fixed scale, :data:`DEPTH_COLOURS`.
+    """Paint depth on a fixed scale, :data:`DEPTH_COLOURS`. Raises ConfigError if the scale is not two increasing
+    numbers.
+
 
     Args:
         depth_m: metres, 0 where unmeasured.
@@ -42,9 +44,6 @@ def colour_depth(
 
     Returns:
         RGB, wider than the depth by the legend.
-
-    Raises:
-        ConfigError: if the scale is not two increasing numbers.
     """
     near, far = (float(end) for end in scale_m)
     if not 0 <= near < far < np.inf:
