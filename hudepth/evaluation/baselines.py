@@ -24,11 +24,7 @@ class Baseline(nn.Module):
 
 
 class ConstantDepth(Baseline):
-    """Predicts the same unit depth map for every image.
-
-    Args:
-        unit_depth: [1, 1, h, w].
-    """
+    """Predicts the same unit depth map for every image."""
 
     unit_depth: Tensor
 
@@ -48,7 +44,7 @@ class NearestFrame(Baseline):
 
     Args:
         store: holds the depths.
-        train: positions of the training pairs.
+        train: positions of the training pairs in it.
         descriptors: of the training images, as :func:`descriptor` makes them.
         fill: unit depth where the copied depth is unmeasured, [1, 1, h, w].
         max_depth_m: depth is clipped to it and divided by it.
@@ -91,16 +87,10 @@ def descriptor(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
 
 
 def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: float) -> dict[str, Baseline]:
-    """Compute the baselines in one pass over the training pairs.
+    """Compute the baselines in one pass over the training pairs, whose positions in the store are ``train``.
 
-    Args:
-        store: holds the pairs.
-        train: positions of the training pairs.
-        max_depth_m: depth is clipped to it and divided by it.
-
-    Returns:
-        ``nearest_frame``: the depth of the most similar training image; ``mean_depth_map``: each pixel's mean over the
-        training set; ``mean_depth``: one mean for all pixels.
+    ``nearest_frame`` is the depth of the most similar training image, ``mean_depth_map`` each pixel's mean over the
+    training set, ``mean_depth`` one mean for all pixels. Depth is clipped to ``max_depth_m`` and divided by it.
     """
     total = torch.zeros(store.size, dtype=torch.float64)
     count = torch.zeros(store.size, dtype=torch.float64)
@@ -116,10 +106,9 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
         count += (unit > 0).sum(dim=0)
     mean = total.sum() / count.sum()
     mean_map = torch.where(count > 0, total / count.clamp(min=1), mean).float()[None, None]
+    descriptors = torch.cat(described)
     return {
-        "nearest_frame": NearestFrame(
-            store, train, descriptors=torch.cat(described), fill=mean_map, max_depth_m=max_depth_m
-        ),
+        "nearest_frame": NearestFrame(store, train, descriptors=descriptors, fill=mean_map, max_depth_m=max_depth_m),
         "mean_depth_map": ConstantDepth(mean_map),
         "mean_depth": ConstantDepth(mean.expand(store.size).float()[None, None]),
     }

@@ -29,13 +29,7 @@ class CommandOptions(ScoreOptions):
 
 
 def test(config: dict[str, Any]) -> None:
-    """Score a checkpoint and write ``test/<protocol>/`` of its run directory. Raises HudepthError with one line for the
-    user.
-
-
-    Args:
-        config: conf/test.yaml with command-line overrides.
-    """
+    """Score a checkpoint and write ``test/<protocol>/`` of its run directory, as conf/test.yaml and overrides ask."""
     options = parse(CommandOptions, config)
     checkpoint = load_checkpoint(options.checkpoint, runs=options.paths["runs"])
     log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data.get("source"))

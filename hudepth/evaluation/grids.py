@@ -1,9 +1,7 @@
 """Predictions on pixel grids: what several protocols have in common is computed once.
 
-A :class:`Grid` is the ground truth of some images at one size, shared by all predictors; a :class:`Scored` is one
-prediction on it, shared by all protocols that resize it in the same way. Error maps and SSIM maps are computed once
-for the whole image; each protocol sums them over its own crop and mask. Only alignment, and clamping that changes
-something, need maps of their own.
+Error maps and SSIM maps are computed once for the whole image; each protocol sums them over its own crop and mask.
+Only alignment, and clamping that changes something, need maps of their own.
 """
 
 from __future__ import annotations
@@ -40,12 +38,7 @@ class Cache:
 
 
 class Grid:
-    """Ground truth of images of one size, and what follows from it alone.
-
-    Args:
-        depth_m: ground-truth depth [m], ignored where not measured.
-        measured: where there is ground truth.
-    """
+    """Ground truth of images of one size, shared by all predictors; ``depth_m`` is ignored where not ``measured``."""
 
     def __init__(self, depth_m: Float[Tensor, "b 1 h w"], measured: Bool[Tensor, "b 1 h w"]) -> None:
         self.depth_m, self.measured = depth_m, measured
@@ -53,11 +46,12 @@ class Grid:
 
     def counts(self, protocol: Protocol) -> Bool[Tensor, "b 1 h w"]:
         """Return which pixels the protocol counts, before its crop; ``measured`` itself if that is all of them."""
-        return self._cache.get(protocol.caps, lambda: self._counts(protocol))
 
-    def _counts(self, protocol: Protocol) -> Tensor:
-        within = protocol.within_caps(self.depth_m)
-        return self.measured if bool((within | ~self.measured).all()) else self.measured & within
+        def compute() -> Tensor:
+            within = protocol.within_caps(self.depth_m)
+            return self.measured if bool((within | ~self.measured).all()) else self.measured & within
+
+        return self._cache.get(protocol.caps, compute)
 
     def windows(self, protocol: Protocol) -> Bool[Tensor, "b 1 rows columns"]:
         """Return which SSIM windows hold only pixels that count."""
@@ -67,12 +61,7 @@ class Grid:
 
 
 class Scored:
-    """A prediction on a grid, for scoring under any number of protocols.
-
-    Args:
-        pred_m: predicted depth at the grid's size [m].
-        grid: the ground truth.
-    """
+    """A prediction [m] on a grid, shared by all protocols that resize it in the same way."""
 
     def __init__(self, pred_m: Float[Tensor, "b 1 h w"], grid: Grid) -> None:
         self.pred_m, self.grid = pred_m, grid
@@ -83,10 +72,7 @@ class Scored:
         return self._cache.get(("prediction", *self._variant(protocol)), lambda: self._prediction(protocol))
 
     def sums(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
-        """Return a row of sums for each image, columns as in :data:`SUM_COLUMNS`.
-
-        An image smaller than the crop, or of which the crop leaves nothing, counts 0 pixels.
-        """
+        """Return a row of :data:`SUM_COLUMNS` per image; where the crop leaves nothing, it counts 0 pixels."""
         height, width = self.grid.depth_m.shape[-2:]
         window = protocol.window(height, width)
         if window is None:
@@ -122,10 +108,8 @@ class Scored:
         return pred_m.clamp(protocol.min_depth_m, protocol.max_depth_m) if protocol.clamp else pred_m
 
     def _maps(self, protocol: Protocol) -> DepthMaps:
-        pred_m = self.prediction(protocol)
-        return self._cache.get(
-            ("maps", *self._variant(protocol)), lambda: depth_maps(pred_m, self.grid.depth_m, self.grid.measured)
-        )
+        pred_m, key = self.prediction(protocol), ("maps", *self._variant(protocol))
+        return self._cache.get(key, lambda: depth_maps(pred_m, self.grid.depth_m, self.grid.measured))
 
     def _ssim(self, protocol: Protocol, rows: slice, columns: slice) -> Float64[Tensor, " b"]:
         size, measured = protocol.ssim_window, self.grid.measured
@@ -133,19 +117,15 @@ class Scored:
         if min(height, width) < size:
             return torch.full((len(measured),), torch.nan, dtype=torch.float64, device=measured.device)
         # the windows inside the crop are windows of the whole image
-        inside = (
-            slice(rows.start, rows.start + height - size + 1),
-            slice(columns.start, columns.start + width - size + 1),
-        )
+        top, left = rows.start, columns.start
+        inside = slice(top, top + height - size + 1), slice(left, left + width - size + 1)
         whole = self.grid.windows(protocol)[..., *inside]
-        values = self._cache.get(
-            ("ssim", size, protocol.ssim_data_range_m, *self._variant(protocol)), lambda: self._ssim_map(protocol)
-        )[..., *inside]
+        key = ("ssim", size, protocol.ssim_data_range_m, *self._variant(protocol))
+        values = self._cache.get(key, lambda: self._ssim_map(protocol))[..., *inside]
         total = torch.where(whole, values, 0.0).sum(dim=(1, 2, 3)).double()
         return total / whole.sum(dim=(1, 2, 3))
 
     def _ssim_map(self, protocol: Protocol) -> Tensor:
-        pred_m, truth_m = (
-            torch.where(self.grid.measured, x, 0.0) for x in (self.prediction(protocol), self.grid.depth_m)
-        )
+        both = self.prediction(protocol), self.grid.depth_m
+        pred_m, truth_m = (torch.where(self.grid.measured, depth_m, 0.0) for depth_m in both)
         return ssim_map(pred_m, truth_m, data_range=protocol.ssim_data_range_m, window=protocol.ssim_window)

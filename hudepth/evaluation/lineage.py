@@ -18,8 +18,9 @@ BEFORE = "before"
 
 
 def lineage(checkpoint: Checkpoint) -> list[dict[str, Any]]:
-    """Return what a checkpoint was trained on (data and split), then what the networks it started from were. Raises
-    CheckpointError if the checkpoint does not state it in a known form.
+    """Return data and split that a checkpoint was trained on, then those of the networks it started from.
+
+    Raises CheckpointError if it does not state them in a known form.
     """
     own = {key: value for key, value in checkpoint.data.items() if key != BEFORE}
     before = checkpoint.data.get(BEFORE, [])
@@ -35,25 +36,16 @@ def read_split(checkpoint: Checkpoint, datamodule: DepthDataModule) -> Split | N
 
 
 def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *, subsets: tuple[str, ...]) -> None:
-    """Refuse a split that evaluates a network on pairs it has seen.
+    """Raise DataError if one of the ``subsets`` would evaluate a network on pairs it has seen.
 
-    A test must not contain validation pairs either: the best epoch was chosen on them. Raises DataError if a pair is in
-    both.
-
-
-    Args:
-        checkpoint: the network, or what it starts from.
-        datamodule: with the split.
-        subsets: the subsets that evaluate the network.
+    A test must not contain validation pairs either: the best epoch was chosen on them. ``checkpoint`` is the network,
+    or what it starts from.
     """
     for number, past in enumerate(lineage(checkpoint)):
         if past.get("fingerprint") != datamodule.store.info["fingerprint"]:
             if past.get("source") == datamodule.source.name:
-                log.warning(
-                    "'%s' was trained on another version of %s, so whether it has seen pairs of this one cannot be "
-                    "checked",
-                    checkpoint.path, past["source"],
-                )  # fmt: skip
+                unknown = "so whether it has seen pairs of this one cannot be checked"
+                log.warning("'%s' was trained on another version of %s, %s", checkpoint.path, past["source"], unknown)
             continue
         trained = (read_split(checkpoint, datamodule) if number == 0 else None) or _remake_split(past, datamodule)
         for subset in subsets:
@@ -85,22 +77,16 @@ def _remake_split(past: Mapping[str, Any], datamodule: DepthDataModule) -> Split
 
 
 def note_scored(checkpoint: Checkpoint, datamodule: DepthDataModule, protocols: Sequence[Protocol]) -> list[int] | None:
-    """Record in the run that its network was evaluated on test images.
+    """Record in the run that its network was evaluated on test images; return its other epochs that were before.
 
-    Returns:
-        The run's other epochs that were evaluated on them before; None if unknown, because the checkpoint was moved
-        out of its run or the run cannot be written.
+    Returns None if they are unknown: the checkpoint was moved out of its run, or the run cannot be written.
     """
     if checkpoint.run is None:
         return None
     try:
-        return run_dir.note_scored(
-            checkpoint.run,
-            epoch=checkpoint.epoch,
-            data=datamodule.source.name,
-            split=datamodule.split.sha256,
-            protocols=[protocol.name for protocol in protocols],
-        )
+        data, split = datamodule.source.name, datamodule.split.sha256
+        names = [protocol.name for protocol in protocols]
+        return run_dir.note_scored(checkpoint.run, epoch=checkpoint.epoch, data=data, split=split, protocols=names)
     except OSError as error:
         log.warning("'%s' cannot record this evaluation on test images (%s)", checkpoint.run, error.strerror)
         return None

@@ -31,7 +31,6 @@ def write_outputs(
     """Summarise, write and print the results of one protocol. Raises ConfigError if the protocol counts no pixel of any
     image.
 
-
     Args:
         folder: to write to.
         protocol: one of the evaluation's.

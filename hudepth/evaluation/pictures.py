@@ -24,14 +24,10 @@ from hudepth.viz.panels import Panel
 def run_panels(
     run: Path, choose: Callable[[DepthDataModule], Sequence[int]], *, config: Mapping[str, Any]
 ) -> list[Panel]:
-    """Predict pairs of a run's data with its best checkpoint. Raises HudepthError if the checkpoint or its data is
-    missing or has changed.
+    """Predict pairs of a run's data with its best checkpoint; ``choose`` returns their positions in the depth store.
 
-
-    Args:
-        run: the run directory.
-        choose: returns the positions of the pairs in the depth store.
-        config: with ``paths``, ``data`` (overrides of the checkpoint's) and ``trust``.
+    ``config`` has ``paths``, ``data`` (overrides of the checkpoint's) and ``trust``. Raises HudepthError if the
+    checkpoint or its data is missing or has changed.
     """
     checkpoint = load_checkpoint(str(run))
     typed = {"cache": config["paths"]["cache"], **config["data"]}
@@ -41,14 +37,9 @@ def run_panels(
 
 
 def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mapping[str, Any]) -> list[Panel]:
-    """Predict the same images with several runs; return one panel per image and run, titled with the run's name. Raises
-    HudepthError as :func:`run_panels`, or if a run's data lacks an image.
+    """Predict the same images with several runs; return one panel per image and run, titled with the run's name.
 
-
-    Args:
-        runs: run directories by name.
-        ids: of the images.
-        config: as for :func:`run_panels`.
+    Raises HudepthError as :func:`run_panels`, or if a run's data lacks an image.
     """
 
     def positions(datamodule: DepthDataModule) -> list[int]:
@@ -66,14 +57,7 @@ def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mappi
 
 @torch.inference_mode()
 def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float) -> list[Panel]:
-    """Predict pairs of a store.
-
-    Args:
-        module: normalised image to unit depth.
-        store: holds the pairs.
-        indices: positions of the pairs.
-        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
-    """
+    """Predict pairs of a store; the network turns a normalised image into depth / max_depth_m."""
     panels = []
     was_training = module.training
     module.eval()

@@ -17,15 +17,10 @@ from hudepth.metrics.protocol import Protocol
 
 
 class Evaluation(LightningModule):
-    """Collects one row of sums per image for each predictor and protocol. Run it with ``Trainer.test``. Raises
-    ConfigError if two protocols have the same name.
+    """Collects one row of sums per image for each predictor and protocol. Run it with ``Trainer.test``.
 
-
-    Args:
-        predictors: by name; normalised image to unit depth.
-        protocols: how to score.
-        max_depth_m: maximum depth [m]; the network predicts depth / max_depth_m.
-        detailed: the predictor whose boundaries and strata are measured too, if a protocol asks for them.
+    Predictors turn a normalised image into depth / max_depth_m; boundaries and strata are measured of the ``detailed``
+    one only, if a protocol asks for them. Raises ConfigError if two protocols have the same name.
     """
 
     def __init__(
@@ -44,14 +39,13 @@ class Evaluation(LightningModule):
             raise ConfigError(f"protocol: two have the same name among {', '.join(names)}. Give each its own name.")
         self.max_depth_m, self.detailed = max_depth_m, detailed
         self._collected: dict[tuple[str, ...], list[Tensor]] = {}
+        # known when the test has ended:
         self.indices: list[int] = []
-        """Store positions of the scored images, in the order of the rows; known when the test has ended."""
+        """Store positions of the scored images, in the order of the rows."""
         self.sums: dict[tuple[str, str], Float64[Tensor, "n k"]] = {}
-        """Rows by predictor and protocol; known when the test has ended."""
+        """By predictor and protocol; the others by protocol, of the detailed predictor."""
         self.boundary: dict[str, Float64[Tensor, "n k"]] = {}
-        """Boundary metrics of the detailed predictor by protocol, one row per image."""
         self.strata: dict[str, Float64[Tensor, "n bins k"]] = {}
-        """Sums over strata of the detailed predictor by protocol."""
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score a batch."""

@@ -48,24 +48,19 @@ class ScoreOptions:
 def score_checkpoint(
     checkpoint: Checkpoint, options: ScoreOptions, *, output: Path, datamodule: DepthDataModule
 ) -> dict[str, Metrics]:
-    """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol. Raises
-    HudepthError with one line for the user.
+    """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol.
 
-
-    Args:
-        checkpoint: what to score.
-        options: how.
-        output: folder for ``<protocol>/metrics.json``, ``per_image.csv``, ``panels.png`` and, if the protocol asks for
-            them, ``strata.csv`` and ``strata.png``.
-        datamodule: with the split to test on.
-
-    Returns:
-        Metrics by protocol, predictor and name; empty except in the first process.
+    Below ``output`` it writes ``<protocol>/metrics.json``, ``per_image.csv``, ``panels.png`` and, if the protocol asks
+    for them, ``strata.csv`` and ``strata.png``. Returns metrics by protocol, predictor and name; empty except in the
+    first process.
     """
     import_trusted(options.trust)
     protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
     output_folder(output)
-    predictors = _build_predictors(checkpoint, options, datamodule)
+    net = checkpoint.build_net(trust=options.trust)
+    predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
+    if options.baselines:
+        predictors |= trivial_baselines(datamodule.store, datamodule.split.train, max_depth_m=datamodule.max_depth_m)
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m, detailed=MODEL)
     if not run_evaluation(evaluation, datamodule, options.trainer):
         return {}
@@ -90,14 +85,9 @@ def score_checkpoint(
 
 
 def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options: Mapping[str, Any]) -> bool:
-    """Run an evaluation over the test subset; return whether this is the first process, which has the results. Raises
-    ConfigError if the devices are not available.
+    """Run an evaluation over the test subset; return whether this is the first process, which has the results.
 
-
-    Args:
-        evaluation: what to run.
-        datamodule: with the test subset.
-        options: arguments of Lightning's Trainer; one device by default.
+    ``options`` are arguments of Lightning's Trainer. Raises ConfigError if the devices are not available.
     """
     with without_known_warnings():
         trainer = build_trainer(
@@ -115,27 +105,14 @@ def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options:
     return trainer.is_global_zero
 
 
-def _build_predictors(
-    checkpoint: Checkpoint, options: ScoreOptions, datamodule: DepthDataModule
-) -> dict[str, nn.Module]:
-    net = checkpoint.build_net(trust=options.trust)
-    predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
-    if options.baselines:
-        predictors |= trivial_baselines(datamodule.store, datamodule.split.train, max_depth_m=datamodule.max_depth_m)
-    return predictors
-
-
 def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any]:
     """Return what metrics.json states about data, split and checkpoint."""
     info = datamodule.store.info
+    trained_on = {**checkpoint.data, "split": checkpoint.split}
     return {
         "data": {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes", "skipped")},
         "split": datamodule.split.summary(),
         "network_size": list(datamodule.size),
         "max_depth_m": datamodule.max_depth_m,
-        "checkpoint": {
-            "file": checkpoint.path.name,
-            "epoch": checkpoint.epoch,
-            "trained_on": {**checkpoint.data, "split": checkpoint.split},
-        },
+        "checkpoint": {"file": checkpoint.path.name, "epoch": checkpoint.epoch, "trained_on": trained_on},
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
@@ -22,20 +23,16 @@ from hudepth.metrics.summary import LOG_BIAS, ImageTable
 
 
 class BatchTruth:
-    """Ground truth of a batch, on the grids that protocols need.
-
-    Args:
-        batch: with the ground truth.
-        max_depth_m: maximum depth [m]; the batch holds depth / max_depth_m.
-    """
+    """Ground truth of a batch, which holds depth / max_depth_m, on the grids that protocols need."""
 
     def __init__(self, batch: Batch, *, max_depth_m: float) -> None:
         self._batch, self._max_depth_m = batch, max_depth_m
         self._cache = Cache()
 
     def grids(self, protocol: Protocol) -> list[Grid]:
-        """Return one grid at network resolution, or one for each image at its native resolution. Raises ConfigError if
-        the protocol needs native ground truth and the batch has none.
+        """Return one grid at network resolution, or one for each image at its native resolution.
+
+        Raises ConfigError if the protocol needs native ground truth and the batch has none.
         """
         return self._cache.get(protocol.needs_native, lambda: self._grids(protocol))
 
@@ -52,11 +49,9 @@ class BatchTruth:
 
 
 class BatchScores:
-    """Predictions of a batch, for scoring under any number of protocols.
+    """Predictions of a batch [m] at network resolution, for scoring under any number of protocols.
 
-    Args:
-        pred_m: predicted depth at network resolution [m].
-        truth: ground truth of the same batch; other predictions may share it.
+    Other predictions may share the ground truth.
     """
 
     def __init__(self, pred_m: Float[Tensor, "b 1 h w"], truth: BatchTruth) -> None:
@@ -103,14 +98,10 @@ class BatchScores:
         grids = self._truth.grids(protocol)
         if not protocol.needs_native:
             return [Scored(self._pred_m, grids[0])]
-        corners = None if protocol.resize == "nearest" else False
+        how: dict[str, Any] = {"mode": _MODES[protocol.resize]}
+        how["align_corners"] = None if protocol.resize == "nearest" else False
         return [
-            Scored(
-                functional.interpolate(
-                    pred[None], size=grid.depth_m.shape[-2:], mode=_MODES[protocol.resize], align_corners=corners
-                ),
-                grid,
-            )
+            Scored(functional.interpolate(pred[None], size=grid.depth_m.shape[-2:], **how), grid)
             for pred, grid in zip(self._pred_m, grids, strict=True)
         ]
 
@@ -125,13 +116,9 @@ def image_table(
     *,
     boundary: Float64[Tensor, "n e"] | None = None,
 ) -> ImageTable:
-    """Turn rows of sums into the metrics of each image.
+    """Turn rows of :meth:`BatchScores.sums` and :meth:`BatchScores.boundary` into the metrics of each image.
 
-    Args:
-        protocol: defines silog.
-        sums: rows of :meth:`BatchScores.sums`.
-        records: the pair of each row.
-        boundary: rows of :meth:`BatchScores.boundary`.
+    ``records`` are the pairs of the rows.
     """
     columns = dict(zip((*SUM_COLUMNS, *registered_functions()), sums.T, strict=True))
     others = {name: columns.pop(name) for name in ("ssim", *registered_functions())}

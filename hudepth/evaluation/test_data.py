@@ -16,19 +16,15 @@ from hudepth.runs.checkpoint import Checkpoint
 def open_data(
     checkpoint: Checkpoint, overrides: Mapping[str, Any], *, typed: Sequence[str] = (), trust: list[str]
 ) -> tuple[DepthDataModule, bool]:
-    """Return the data to test a checkpoint on, with the split it was trained with, or another data set. Raises
-    HudepthError if it cannot be built, or if test pairs were trained on.
+    """Return the data to test a checkpoint on, and whether data set or split differ from those of the training.
 
+    Raises HudepthError if it cannot be built, or if test pairs were trained on.
 
     Args:
         checkpoint: states what it was trained on.
-        overrides: keys of ``data`` that replace the checkpoint's, ``cache`` among them; with ``_target_``, another
-            data set.
+        overrides: keys of ``data`` that replace the checkpoint's; with ``_target_``, another data set.
         typed: command-line overrides, which tell a chosen size from the data set's default.
         trust: packages whose classes the configuration may name.
-
-    Returns:
-        The data, and whether data set or split differ from those of the training.
     """
     datamodule = build_data(_data_config(checkpoint, overrides, typed), trust=trust)
     other_data = "_target_" in overrides or any(key.startswith(("split", "fractions")) for key in overrides)
@@ -55,8 +51,7 @@ def _data_config(checkpoint: Checkpoint, overrides: Mapping[str, Any], typed: Se
                 "To test on another data set pass data=<name>."
             )
         data = {**trained, **overrides, "source": {**trained.get("source", {}), **overrides.get("source", {})}}
-    before_m, now_m = trained.get("max_depth_m"), data.get("max_depth_m")
-    if before_m != now_m:
+    if (before_m := trained.get("max_depth_m")) != (now_m := data.get("max_depth_m")):
         raise ConfigError(
             f"data.max_depth_m: the network was trained for {before_m} m, which scales its output, not for {now_m} m. "
             "Leave data.max_depth_m out."

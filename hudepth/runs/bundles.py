@@ -29,12 +29,7 @@ MAX_WEIGHTS_BYTES = 1 << 32
 
 
 def pretrained(name: str) -> Path:
-    """Return the folder of a bundled pretrained model. Raises CheckpointError if this installation lacks it.
-
-
-    Args:
-        name: one of :data:`PRETRAINED`.
-    """
+    """Return the folder of one of :data:`PRETRAINED`. Raises CheckpointError if this installation lacks it."""
     spec = find_spec("hudepth.pretrained")
     folders = list(spec.submodule_search_locations or []) if spec else []
     folder = next((path for root in folders if is_bundle(path := Path(root) / name)), None)
@@ -54,24 +49,17 @@ def is_bundle(path: Path) -> bool:
 
 
 def read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Any], int]:
-    """Read a bundle; nothing is unpacked to the disk, and nothing in it can run code. Raises CheckpointError if it is
-    damaged, too large, holds paths outside its folder, or is not a bundle.
+    """Return a bundle's configuration, its tensors, and the number of bytes they were read from.
 
-
-    Args:
-        path: a folder, its ``model.safetensors``, or a zip of the folder.
-
-    Returns:
-        Its configuration, its tensors, and the number of bytes they were read from.
+    ``path`` is a folder, its ``model.safetensors``, or a zip of the folder; nothing is unpacked to the disk, and
+    nothing in it can run code. Raises CheckpointError if it is damaged, too large, not a bundle, or holds paths outside
+    its folder.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    if path.suffix.lower() == ".zip":
-        config, weights = _from_zip(path)
-    else:
-        folder = path if path.is_dir() else path.parent
-        config, weights = _from_folder(folder)
+    is_zip = path.suffix.lower() == ".zip"
+    config, weights = _from_zip(path) if is_zip else _from_folder(path if path.is_dir() else path.parent)
     try:
         content = json.loads(config)
     except (ValueError, RecursionError) as error:
@@ -101,18 +89,14 @@ def _from_zip(path: Path) -> tuple[bytes, bytes]:
     try:
         with zipfile.ZipFile(path) as archive:
             for name in archive.namelist():
-                _check_inside(path, name)
+                windows = PureWindowsPath(name)
+                if name.startswith("/") or windows.anchor or ".." in {*PurePosixPath(name).parts, *windows.parts}:
+                    raise CheckpointError(f"'{path}' is refused: it holds '{name}', a path outside its folder.")
             return _member(path, archive, CONFIG, MAX_CONFIG_BYTES), _member(path, archive, WEIGHTS, MAX_WEIGHTS_BYTES)
     except CheckpointError:
         raise
     except Exception as error:  # zipfile raises many kinds
         raise CheckpointError(f"'{path}' cannot be read as a zip; it is damaged or cut off ({error}).") from error
-
-
-def _check_inside(path: Path, name: str) -> None:
-    windows = PureWindowsPath(name)
-    if name.startswith("/") or windows.anchor or ".." in {*PurePosixPath(name).parts, *windows.parts}:
-        raise CheckpointError(f"'{path}' is refused: it holds '{name}', a path outside its folder.")
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:

@@ -29,9 +29,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes to a temporary file, then renames it: a full disk or a kill never costs the previous checkpoint."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write ``checkpoint`` to ``path``, whole or not at all. Raises TrainingError if the disk is full or the folder
-        cannot be written; the previous checkpoint is intact.
-        """
+        """Write a checkpoint. Raises TrainingError if that is not possible; the previous one is intact."""
         try:
             with written_whole(Path(path)) as part:
                 torch.save(checkpoint, part)
@@ -42,10 +40,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             ) from error
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 @dataclass(frozen=True)
 class Checkpoint:
     """A checkpoint, read and checked; no network is built yet."""
@@ -54,7 +48,6 @@ class Checkpoint:
     run: Path | None
     """Its run directory, None if it was moved elsewhere."""
     config: dict[str, Any]
-    """The run's resolved configuration."""
     split: dict[str, Any]
     """Summary of the split it was trained on."""
     data: dict[str, Any]
@@ -62,21 +55,15 @@ class Checkpoint:
     epoch: int
     """Finished epochs."""
     state: dict[str, Tensor]
-    """The network's tensors."""
     size_bytes: int
     """Of the file that the tensors were read from: no valid network is larger."""
 
     def build_net(self, *, trust: list[str]) -> nn.Module:
-        """Return the network in evaluation mode.
+        """Return the network in evaluation mode; its configuration may name classes of the modules in ``trust``.
 
         It is first built on the meta device and compared with the checkpoint's tensors, so that a configuration that
         asks for more than the file holds cannot exhaust memory. Trusted code is built once, without this check. Raises
-        CheckpointError if the tensors do not fit the configured network; ConfigError if the configuration names an
-        untrusted class, or one that is not a network.
-
-
-        Args:
-            trust: further modules whose classes the configuration may name.
+        CheckpointError if the tensors do not fit; ConfigError if the class is untrusted or not a network.
         """
         model = dict(self.config["model"])
         if "weights" in model:
@@ -109,13 +96,10 @@ class Checkpoint:
 
 
 def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
-    """Return the file or folder that ``spec`` refers to. Raises CheckpointError if there is no such file.
+    """Return the file or folder that ``spec`` refers to. Raises CheckpointError if there is none.
 
-
-    Args:
-        spec: a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run); or
-            one of :data:`hudepth.runs.bundles.PRETRAINED`.
-        runs: where ``last`` looks.
+    ``spec`` is a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run below
+    ``runs``); or one of :data:`hudepth.runs.bundles.PRETRAINED`.
     """
     if spec in bundles.PRETRAINED:
         return bundles.pretrained(spec)
@@ -133,18 +117,22 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     return path
 
 
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 def read_plain(path: Path) -> dict[str, Any]:
-    """Read a file of plain types; files with anything else are refused without running code. Raises CheckpointError if
-    the file is damaged, holds code, or unpacks to more than its own size.
-    """
+    """Read a file of plain types. Raises CheckpointError, without running code, for anything else."""
     _check_archive(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        raise CheckpointError(
-            f"'{path}' is refused: it holds more than tensors and plain values, so loading it could run code. "
-            "Use a checkpoint written by hudepth-train."
-        ) from error
+        why = "it holds more than tensors and plain values, so loading it could run code"
+        raise CheckpointError(f"'{path}' is refused: {why}. Use a checkpoint written by hudepth-train.") from error
     except Exception as error:
         raise _damaged(path, error) from error
     if not isinstance(content, dict):
@@ -162,9 +150,8 @@ def _check_archive(path: Path) -> None:
     except Exception as error:  # zipfile raises many kinds
         raise _damaged(path, error) from error
     if not fits:
-        raise CheckpointError(
-            f"'{path}' is refused: it unpacks to more than its own size. Use a checkpoint written by hudepth-train."
-        )
+        why = "it unpacks to more than its own size"
+        raise CheckpointError(f"'{path}' is refused: {why}. Use a checkpoint written by hudepth-train.")
     if broken:
         raise _damaged(path, zipfile.BadZipFile(f"'{broken}' has a wrong checksum"))
 
@@ -174,14 +161,7 @@ def _damaged(path: Path, error: Exception) -> CheckpointError:
 
 
 def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
-    """Find and read a checkpoint. Raises CheckpointError if it is missing, damaged, holds code, or was not written by
-    hudepth.
-
-
-    Args:
-        spec: a file, a run directory, or ``last``.
-        runs: where ``last`` looks.
-    """
+    """Read what :func:`find_checkpoint` finds. Raises CheckpointError if it is damaged, holds code, or is not ours."""
     path = find_checkpoint(spec, runs=runs)
     if bundles.is_bundle(path):
         own, tensors, size_bytes = bundles.read_bundle(path)
@@ -194,27 +174,18 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
         tensors, run = content["state_dict"], find_run(path.resolve())
         epoch = content["epoch"] + 1 if isinstance(content.get("epoch"), int) else None
     if own.get("version") != VERSION:
-        raise CheckpointError(
-            f"'{path}' has format version {own.get('version')}, this hudepth reads {VERSION}. {_fix_version(own)}"
+        fix = (
+            "It was written by a pre-release of hudepth 0.1: train or export again with this version."
+            if own.get("version") == 1
+            else "Use the version of hudepth that wrote it, or train again with this one."
         )
+        raise CheckpointError(f"'{path}' has format version {own.get('version')}, this hudepth reads {VERSION}. {fix}")
     config, split, data = own.get("config"), own.get("split"), own.get("data")
-    if not (
-        isinstance(config, dict)
-        and isinstance(config.get("model"), dict)
-        and isinstance(split, dict)
-        and isinstance(data, dict)
-        and isinstance(epoch, int)
-        and _is_state(tensors)
-    ):
+    mappings = isinstance(config, dict) and all(isinstance(part, dict) for part in (config.get("model"), split, data))
+    if not (mappings and isinstance(epoch, int) and _is_state(tensors)):
         raise CheckpointError(f"'{path}' is incomplete: configuration, split, data, epoch or tensors are missing.")
     state = {n.removeprefix(NET_PREFIX): v for n, v in tensors.items() if n.startswith(NET_PREFIX)}
     return Checkpoint(path, run, config, split, data, epoch, state, size_bytes)
-
-
-def _fix_version(own: dict[str, Any]) -> str:
-    if own.get("version") == 1:
-        return "It was written by a pre-release of hudepth 0.1: train or export again with this version."
-    return "Use the version of hudepth that wrote it, or train again with this one."
 
 
 def _is_state(value: object) -> bool:

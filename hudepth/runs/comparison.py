@@ -1,8 +1,4 @@
-"""Which test results may be compared, and what they have in common.
-
-A number is meaningful only with its protocol, data and split. Results are put side by side where these agree, or
-together with what differs.
-"""
+"""Which test results may be compared (those of one protocol, data and split), and what they have in common."""
 
 from __future__ import annotations
 
@@ -28,11 +24,8 @@ def stamp_differences(a: Result, b: Result) -> list[str]:
     split; and, for protocols that score at network resolution, size and maximum depth, which define the ground truth.
     """
     before, after = _conditions(a), _conditions(b)
-    return [
-        f"{key}: {_format(before.get(key))} against {_format(after.get(key))}"
-        for key in dict.fromkeys([*before, *after])
-        if before.get(key) != after.get(key)
-    ]
+    changed = [key for key in dict.fromkeys([*before, *after]) if before.get(key) != after.get(key)]
+    return [f"{key}: {_format(before.get(key))} against {_format(after.get(key))}" for key in changed]
 
 
 def _conditions(result: Result) -> dict[str, Any]:
@@ -52,10 +45,9 @@ def _format(value: Any) -> str:
 
 
 def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
-    """Return the images of two results, in the order of the first.
+    """Return the images of two results, in the order of the first; their splits may differ in the training pairs.
 
-    The splits may differ in their training pairs, as long as the test images are the same. Raises DataError if
-    protocol, data or images differ; the message suggests a fix.
+    Raises DataError if protocol, data or images differ.
     """
     where = _check_conditions(a, b)
     first, second = _take_common(a.table, b.table)
@@ -74,8 +66,9 @@ def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
 
 
 def common_images(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
-    """Return the images that are in both results, in the order of the first; for two splits of one data set. Raises
-    DataError if protocol or data differ, or if they share no image.
+    """Return the images that are in both results, in the order of the first; for two splits of one data set.
+
+    Raises DataError if protocol or data differ, or if they share no image.
     """
     where = _check_conditions(a, b)
     tables = _take_common(a.table, b.table)
@@ -119,15 +112,10 @@ def _take(table: ImageTable, rows: Sequence[int]) -> ImageTable:
 
 
 def merge(results: Mapping[str, Result], *, metrics: Sequence[str], mark: bool = False) -> list[dict[str, str | float]]:
-    """Return the rows of a table, one per result: ``name``, then the metrics of its network. Raises DataError if they
-    differ and ``mark`` is not set, or if no result has a metric.
+    """Return the rows of a table, one per result: ``name``, then the metrics of its network, NaN where it lacks one.
 
-
-    Args:
-        results: by the name of their row.
-        metrics: columns; NaN where a result lacks one.
-        mark: where protocols, data or splits differ, add the columns ``protocol``, ``data`` and ``split`` as needed
-            to tell the rows apart, instead of raising.
+    Where protocols, data or splits differ, ``mark`` adds the columns ``protocol``, ``data`` and ``split`` as needed to
+    tell the rows apart. Raises DataError if they differ and it is not set, or if no result has a metric.
     """
     known = {name for result in results.values() for name in result.metrics}
     for name in metrics:
@@ -155,24 +143,17 @@ def _marks(results: Mapping[str, Result]) -> dict[str, dict[str, str]]:
     """Return which of protocol, data and split differ, and a text for each result that tells it apart."""
     conditions = {name: _conditions(result) for name, result in results.items()}
     pairs = list(combinations(conditions.values(), 2))
-    marks = {}
+    marks: dict[str, dict[str, str]] = {}
     for column, main in (("protocol", "protocol.name"), ("data", "data.source"), ("split", "split.kind")):
-        keys = dict.fromkeys(key for each in conditions.values() for key in each if _column(key) == column)
+        keys = dict.fromkeys(key for each in conditions.values() for key in each)
         # what differs between results of the same name is added to the name
-        more = [k for k in keys if any(x[main] == y[main] and x.get(k) != y.get(k) for x, y in pairs)]
+        own = [k for k in keys if column == (k.partition(".")[0] if k.startswith(("data.", "split.")) else "protocol")]
+        more = [k for k in own if any(x[main] == y[main] and x.get(k) != y.get(k) for x, y in pairs)]
         if more or any(x[main] != y[main] for x, y in pairs):
-            marks[column] = {
-                name: ", ".join(
-                    [str(x[main]), *(f"{k.partition('.')[2] or k} {_format(x[k])}" for k in more if k in x)]
-                )
-                for name, x in conditions.items()
-            }
+            for name, x in conditions.items():
+                details = (f"{k.partition('.')[2] or k} {_format(x[k])}" for k in more if k in x)
+                marks.setdefault(column, {})[name] = ", ".join([str(x[main]), *details])
     return marks
-
-
-def _column(key: str) -> str:
-    part = key.partition(".")[0]
-    return part if part in ("data", "split") else "protocol"
 
 
 def _first(lines: Sequence[str]) -> str:

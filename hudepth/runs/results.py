@@ -62,22 +62,15 @@ class Result:
     @property
     def averaging(self) -> dict[str, Any]:
         """The protocol's options for :func:`hudepth.metrics.summary.summarise` and the bootstrap."""
-        silog = self.stamp["silog"]
-        return {
-            "averaging": self.stamp["averaging"],
-            "silog_lambda": float(silog["lambda"]),
-            "silog_factor": float(silog["factor"]),
-        }
+        weight, factor = (float(self.stamp["silog"][key]) for key in ("lambda", "factor"))
+        return {"averaging": self.stamp["averaging"], "silog_lambda": weight, "silog_factor": factor}
 
 
 def find_result(run_or_folder: str | Path, protocol: str) -> Result:
     """Read a test result. Raises DataError if there is none, or if its files are damaged or do not belong together.
 
-
-    Args:
-        run_or_folder: a run directory, the folder of a study, their folder ``test`` (or another ``output=`` of
-            hudepth-test), or the folder of the protocol itself.
-        protocol: its name.
+    The folder is a run directory, that of a study, their folder ``test`` (or another ``output=`` of hudepth-test), or
+    the folder of the protocol itself.
     """
     folder = Path(run_or_folder).expanduser()
     if not folder.is_dir():
@@ -92,11 +85,8 @@ def find_result(run_or_folder: str | Path, protocol: str) -> Result:
             f"Run hudepth-test checkpoint={folder} protocol={protocol}."
         )
     result = _read(found)
-    if result.protocol_name != protocol:
-        raise DataError(
-            f"'{found}' is a test result of protocol '{result.protocol_name}', not of '{protocol}'. "
-            f"Pass protocol={result.protocol_name}."
-        )
+    if (name := result.protocol_name) != protocol:
+        raise DataError(f"'{found}' is a test result of protocol '{name}', not of '{protocol}'. Pass protocol={name}.")
     return result
 
 

@@ -88,9 +88,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def newest_run(runs: str | Path) -> Path:
-    """Return the run below ``runs`` that was written to last and has a checkpoint. Raises CheckpointError if there is
-    none.
-    """
+    """Return the run with a checkpoint below ``runs`` that was written to last. Raises CheckpointError if none is."""
     root = Path(runs).expanduser()
     found = [c.parent.parent for name in (BEST, LAST) for c in root.glob(f"*/*/{CHECKPOINTS}/{name}")]
     if not found:

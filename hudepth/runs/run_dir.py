@@ -31,9 +31,7 @@ SCORED = "scored.json"
 
 
 def create(parent: str | Path, name: str) -> Path:
-    """Make ``<parent>/<name>/<date_time>``; a second run within the same second gets a number appended. Raises
-    ConfigError if the folder cannot be made.
-    """
+    """Make ``<parent>/<name>/<date_time>``, with a number appended if it exists. Raises ConfigError if it cannot."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     base = Path(parent).expanduser() / name
     for attempt in range(1, 1000):
@@ -53,9 +51,7 @@ def create(parent: str | Path, name: str) -> Path:
 def write_start(
     run: Path, *, config: Mapping[str, Any], overrides: Sequence[str], environment: Mapping[str, Any]
 ) -> None:
-    """Write what is known before a run begins: config.yaml, overrides.txt, environment.json. Raises ConfigError if the
-    folder cannot be written.
-    """
+    """Write config.yaml, overrides.txt and environment.json. Raises ConfigError if the folder cannot be written."""
     try:
         _write_config(run, config, overrides)
         write_json(run / "environment.json", dict(environment))
@@ -66,9 +62,7 @@ def write_start(
 
 
 def write_resumed(run: Path, *, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Write the configuration of a resumed run, and append its overrides to overrides.txt. Raises ConfigError if the
-    folder cannot be written.
-    """
+    """Write config.yaml again and append to overrides.txt. Raises ConfigError if the folder cannot be written."""
     file = run / "overrides.txt"
     try:
         earlier = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
@@ -99,21 +93,10 @@ def log_to_file(path: Path) -> Iterator[None]:
 
 
 def note_scored(run: Path, *, epoch: int, data: str, split: str, protocols: Sequence[str]) -> list[int]:
-    """Record in scored.json that a run's network was evaluated on test images.
+    """Record in scored.json that a run's network was evaluated on the test images of a split, given by its hash.
 
-    Choosing among several results on test images makes the best one biased, so every evaluation is recorded. Raises
-    OSError if the file cannot be written.
-
-
-    Args:
-        run: the run directory.
-        epoch: epoch of the checkpoint.
-        data: name of the data set.
-        split: hash of the split.
-        protocols: names of the protocols.
-
-    Returns:
-        Epochs of the run's other checkpoints that were evaluated on these test images before.
+    Choosing among several results on test images makes the best one biased, so every evaluation is recorded. Returns
+    the epochs of the run's other checkpoints that were evaluated on these images before. Raises OSError.
     """
     earlier = read_scored(run)
     now = datetime.now(UTC).isoformat(timespec="seconds")

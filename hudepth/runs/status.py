@@ -67,13 +67,9 @@ def _is_locked(run: Path) -> bool:
 
 @contextmanager
 def lock_run(run: Path, *, timeout_s: float = 0) -> Iterator[None]:
-    """Keep other processes from working in a run directory during the block; a killed process releases its lock. Raises
-    LockedError if another process still holds it; ConfigError if the folder cannot be written.
+    """Keep other processes from working in a run directory during the block; a killed process releases its lock.
 
-
-    Args:
-        run: the run directory.
-        timeout_s: how long to wait for another process to release it.
+    Raises LockedError if another process holds it after ``timeout_s``; ConfigError if the folder cannot be written.
     """
     lock = FileLock(run / LOCK)
     try:

@@ -49,19 +49,14 @@ class Sweep:
 
 
 def read_sweep(folder: str | Path, *, name: str | None = None) -> Sweep:
-    """Read a sweep's folder, with or without sweep.yaml; folders that are not runs are skipped, with a note. Raises
-    DataError if there is no such folder, run or sweep.
+    """Read a folder of sweeps, or the sweep ``name`` in it; folders that are not runs are skipped, with a note.
 
-
-    Args:
-        folder: the sweep's.
-        name: one of the sweeps that were run in it; default: all.
+    Raises DataError if there is no such folder, run or sweep.
     """
     root = Path(folder).expanduser()
     if not root.is_dir():
-        raise DataError(
-            f"dir: no folder '{root}'. Pass dir=<folder of a sweep>, for example sweeps/<name>/<date_time>."
-        )
+        example = "sweeps/<name>/<date_time>"
+        raise DataError(f"dir: no folder '{root}'. Pass dir=<folder of a sweep>, for example {example}.")
     notes: list[str] = []
     jobs = _select_jobs(root, name, notes)
     labels = {str(job["run"]): dict(job["labels"]) for job in reversed(jobs) if job.get("run")}
@@ -78,10 +73,9 @@ def read_sweep(folder: str | Path, *, name: str | None = None) -> Sweep:
             notes.append(f"skipped: {error}")
     uncomposed = [(dict(job["labels"]), str(job.get("error", ""))) for job in jobs if not job.get("run")]
     if not runs and not uncomposed:
-        raise DataError(
-            f"dir: '{root}' holds no run. Pass dir=<folder of a sweep>, whose folders are run directories"
-            + (f" ({len(found)} other folders lie in it)." if found else ".")
-        )
+        others = f" ({len(found)} other folders lie in it)" if found else ""
+        fix = f"Pass dir=<folder of a sweep>, whose folders are run directories{others}."
+        raise DataError(f"dir: '{root}' holds no run. {fix}")
     return Sweep(root, runs, uncomposed, notes)
 
 
@@ -124,9 +118,9 @@ def _outcome(job: Mapping[str, Any]) -> dict[str, str]:
 
 
 def write_jobs(folder: Path, name: str, jobs: Sequence[Mapping[str, Any]]) -> None:
-    """Add the jobs of a sweep to sweep.yaml; jobs already listed stay, in their order.
+    """Add the jobs of a sweep to sweep.yaml; those listed stay, in their order, except failed ones tried again.
 
-    A job that could not be composed is replaced when it is tried again. Raises OSError if the file cannot be written.
+    Raises OSError if the file cannot be written.
     """
     try:
         sweeps = read_jobs(folder)

@@ -33,17 +33,10 @@ def colour_map(name: str) -> Colormap:
 def colour_depth(
     depth_m: Float[np.ndarray, "h w"], *, scale_m: tuple[float, float], legend: bool = True
 ) -> UInt8[np.ndarray, "h w2 3"]:
-    """Paint depth on a fixed scale, :data:`DEPTH_COLOURS`. Raises ConfigError if the scale is not two increasing
-    numbers.
+    """Paint depth (0 where unmeasured) in RGB on a fixed scale, by default with a legend appended on the right.
 
-
-    Args:
-        depth_m: metres, 0 where unmeasured.
-        scale_m: depths of the two ends; depths beyond them are clipped.
-        legend: whether to append a scale in metres on the right.
-
-    Returns:
-        RGB, wider than the depth by the legend.
+    ``scale_m`` holds the depths of the two ends of :data:`DEPTH_COLOURS`; depths beyond them are clipped. Raises
+    ConfigError if they are not two increasing numbers.
     """
     near, far = (float(end) for end in scale_m)
     if not 0 <= near < far < np.inf:

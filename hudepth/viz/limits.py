@@ -11,11 +11,7 @@ FAR = 12.0
 
 
 def usual_range(values: Iterable[float]) -> tuple[float, float]:
-    """Return the smallest and the largest of the finite values that are not far out.
-
-    Returns:
-        (0, 1) if there is none.
-    """
+    """Return the smallest and the largest of the finite values that are not far out; (0, 1) if there is none."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return 0.0, 1.0

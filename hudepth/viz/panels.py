@@ -35,16 +35,10 @@ class Panel:
 
 
 def draw_panels(panels: Sequence[Panel]) -> NDArray[np.uint8]:
-    """Draw one row per panel: RGB, ground truth, prediction, absolute error.
+    """Draw RGB, ground truth, prediction and absolute error of at least one panel, a row each; return [H, W, 3] RGB.
 
     Rows share a depth scale, from the smallest to the largest ground truth, and an error scale, up to the 99th
     percentile.
-
-    Args:
-        panels: at least one.
-
-    Returns:
-        [H, W, 3] RGB.
     """
     canvas: Any = FigureCanvasAgg(_literal(_figure(panels)))
     canvas.draw()

@@ -44,12 +44,9 @@ class PointCloud:
 def point_cloud(
     depth_m: Float[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"] | None, intrinsics: Intrinsics | None = None
 ) -> PointCloud:
-    """Lift each pixel to a point; pixels of depth 0 are left out.
+    """Lift each pixel to a point, coloured by the RGB image; pixels of depth 0 are left out.
 
-    Args:
-        depth_m: distance along the optical axis [m].
-        image: RGB of the same size, for colour.
-        intrinsics: of the camera, in pixels of ``depth_m``; default: those of NYU, scaled to its size.
+    ``depth_m`` is measured along the optical axis; the intrinsics, in its pixels, are by default those of NYU, scaled.
     """
     height, width = depth_m.shape
     camera = intrinsics or Intrinsics.of_nyu(height, width)

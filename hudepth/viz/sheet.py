@@ -13,12 +13,7 @@ from hudepth.viz.panels import MIN_SPAN_M, Panel
 
 
 def draw_sheet(predictions: Mapping[str, Sequence[Panel]], *, titles: Sequence[str] = ()) -> Figure:
-    """Draw images, their ground truth, and what each network predicts, on one scale in metres.
-
-    Args:
-        predictions: by network, a panel for each image, the same images in the same order.
-        titles: of the images.
-    """
+    """Draw images, their ground truth, and the panels of each network, in the same order, on one scale in metres."""
     first = next(iter(predictions.values()))
     measured = np.concatenate([panel.truth_m[panel.truth_m > 0] for panel in first])
     low, high = (float(measured.min()), float(measured.max())) if measured.size else (0.0, 1.0)

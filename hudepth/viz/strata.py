@@ -17,12 +17,7 @@ RARE = 0.01
 
 
 def draw_strata(rows: Sequence[Stratum], *, title: str = "") -> Figure:
-    """Draw abs_rel of each bin as a bar, and the bin's share of the pixels next to its name.
-
-    Args:
-        rows: bins of any number of groups, those of a group together; at least one.
-        title: above the figure.
-    """
+    """Draw abs_rel of each bin (at least one) as a bar, and the bin's share of the pixels next to its name."""
     groups = [[row for row in rows if row.group == group] for group in dict.fromkeys(row.group for row in rows)]
     lines = -(-len(groups) // 2)
     heights = [max(len(group) for group in groups[2 * i : 2 * i + 2]) + 2.5 for i in range(lines)]
@@ -46,7 +41,8 @@ def _draw_group(axis: Axes, rows: Sequence[Stratum], *, right: float) -> None:
         # a bar longer than the axis has its number inside
         end, side = (length, "left") if length < 0.9 * right else (right, "right")
         axis.annotate(f" {row.abs_rel:.3f} ", (end, place), ha=side, va="center", fontsize=8)
-    labels = [f"{row.label.replace('_', ' ')}   {_percent(row.share)}" for row in rows]
+    shares = [f"{100 * row.share:.0f} %" if row.share >= RARE else "< 1 %" for row in rows]
+    labels = [f"{row.label.replace('_', ' ')}   {share}" for row, share in zip(rows, shares, strict=True)]
     axis.set_yticks(range(len(rows)), labels, fontsize=8)
     axis.invert_yaxis()
     axis.set_xlim(0, right)
@@ -54,10 +50,6 @@ def _draw_group(axis: Axes, rows: Sequence[Stratum], *, right: float) -> None:
     axis.tick_params(labelbottom=True, axis="x", labelsize=8)
     axis.grid(axis="x", alpha=0.3)
     axis.set_axisbelow(True)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= RARE else "< 1 %"
 
 
 def save_strata(path: Path, rows: Sequence[Stratum], *, title: str = "") -> None:
