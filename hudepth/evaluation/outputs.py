@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.measure import Measurement
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
 from hudepth.base.files import write_json, write_text
+from hudepth.base.tables import Cell, Table, stdout
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.routine import Evaluation
 from hudepth.evaluation.scoring import image_table
-from hudepth.evaluation.tables import print_results
 from hudepth.metrics.bootstrap import describe, intervals
+from hudepth.metrics.catalogue import Level, metric_info, metric_names
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.strata import strata_csv, summarise_strata
 from hudepth.metrics.summary import ImageTable, per_image_csv, summarise
@@ -23,20 +27,17 @@ from hudepth.viz.strata import save_strata
 
 Metrics = dict[str, dict[str, float]]
 """By predictor and name."""
+LEVELS: tuple[Level, ...] = ("wide", "narrow", "headline")
+"""Columns of the printed table; the first level that fits the terminal. metrics.json always has all metrics."""
 
 
 def write_outputs(
     folder: Path, protocol: Protocol, evaluation: Evaluation, datamodule: DepthDataModule, stamp: Mapping[str, Any]
 ) -> Metrics:
-    """Summarise, write and print the results of one protocol. Raises ConfigError if the protocol counts no pixel of any
-    image.
+    """Summarise, write and print the results of one protocol of a finished evaluation of the test subset.
 
-    Args:
-        folder: to write to.
-        protocol: one of the evaluation's.
-        evaluation: finished.
-        datamodule: whose test subset was scored.
-        stamp: what else metrics.json states: data, split, checkpoint.
+    ``stamp`` is what else metrics.json states: data, split, checkpoint. Raises ConfigError if no pixel of any image
+    counts.
     """
     tables = _image_tables(protocol, evaluation, datamodule)
     model = tables[MODEL]
@@ -69,13 +70,11 @@ def write_outputs(
 
 def _image_tables(protocol: Protocol, evaluation: Evaluation, datamodule: DepthDataModule) -> dict[str, ImageTable]:
     records = [datamodule.store.records[index] for index in evaluation.indices]
+    boundary = {MODEL: evaluation.boundary.get(protocol.name)}
     return {
-        name: image_table(
-            protocol, evaluation.sums[name, protocol.name], records,
-            boundary=evaluation.boundary.get(protocol.name) if name == MODEL else None,
-        )
+        name: image_table(protocol, evaluation.sums[name, protocol.name], records, boundary=boundary.get(name))
         for name in evaluation.predictors
-    }  # fmt: skip
+    }
 
 
 def _left_out(protocol: Protocol, table: ImageTable) -> list[str]:
@@ -84,13 +83,64 @@ def _left_out(protocol: Protocol, table: ImageTable) -> list[str]:
     if len(ids) == len(table.ids):
         raise ConfigError(f"protocol={protocol.name}: no pixel of {len(ids)} images counts. Check its crop and caps.")
     if ids:
-        log.warning(
-            "protocol=%s: no pixel of %d of %d images counts (unmeasured, outside the caps, or smaller than the crop); "
-            "left out, the first is '%s'",
-            protocol.name, len(ids), len(table.ids), ids[0],
-        )  # fmt: skip
+        why = "unmeasured, outside the caps, or smaller than the crop"
+        text = "protocol=%s: no pixel of %d of %d images counts (%s); left out, the first is '%s'"
+        log.warning(text, protocol.name, len(ids), len(table.ids), why, ids[0])
     return ids
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def print_results(
+    metrics: Mapping[str, Mapping[str, float]], ranges: Mapping[str, tuple[float, float]], *, over: str, title: str
+) -> None:
+    """Print metrics, one row per predictor, the best of each column bold, with the first predictor's 95 % intervals.
+
+    ``over`` is what was resampled, for example ``215 scenes``.
+    """
+    first = next(iter(metrics))
+    caption = f"95 %: bootstrap over {over}"
+    _print_widest([make_table(metrics, ranges, metric_names(level), title, caption) for level in LEVELS])
+    if edges := metric_names("edges", among=metrics[first]):
+        chosen = [edges, metric_names("edge", among=edges)]
+        only = {first: metrics[first]}
+        _print_widest([make_table(only, ranges, names, "depth edges of the model", "") for names in chosen])
+
+
+def make_table(
+    metrics: Mapping[str, Mapping[str, float]],
+    ranges: Mapping[str, tuple[float, float]],
+    names: Sequence[str],
+    title: str,
+    caption: str,
+) -> Table:
+    """Return a table of some metrics; other arguments as for :func:`print_results`."""
+    infos = [metric_info(name) for name in names]
+    rising = ", ".join(info.name for info in infos if info.higher_is_better)
+    caption = "; ".join(filter(None, [f"higher is better: {rising}" if rising else "", caption]))
+    table = Table(["", *(info.label for info in infos)], title=title, caption=caption)
+    best = {
+        info.name: (max if info.higher_is_better else min)(row[info.name] for row in metrics.values())
+        for info in infos
+    }  # fmt: skip
+    for number, (who, row) in enumerate(metrics.items()):
+        cells = [
+            Cell(info.format(row[info.name]), bold=len(metrics) > 1 and row[info.name] == best[info.name])
+            for info in infos
+        ]
+        table.add(who.replace("_", " "), *cells)
+        if number == 0:
+            for word, side in (("  95 % from", 0), ("       to", 1)):
+                table.add(Cell(word, dim=True), *(Cell(i.format(ranges[i.name][side]), dim=True) for i in infos))
+    return table
+
+
+def _print_widest(tables: Sequence[Table]) -> None:
+    """Print the first table that fits the terminal, else the last."""
+    console = stdout()
+    built = [table.to_rich(box=SIMPLE_HEAD, show_edge=False, pad_edge=False) for table in tables]
+    unbounded = console.options.update(width=1000)
+    fitting = (table for table in built if Measurement.get(console, unbounded, table).maximum <= console.width)
+    console.print(next(fitting, built[-1]))

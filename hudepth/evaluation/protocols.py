@@ -12,9 +12,7 @@ from hudepth.metrics.protocol import Protocol
 
 
 def build_protocols(protocols: Mapping[str, Any], *, datamodule: DepthDataModule, trust: list[str]) -> list[Protocol]:
-    """Build the test protocols of a configuration, in its order. Raises ConfigError if there is none, if one cannot be
-    built, or if one needs native depth and the data has none.
-    """
+    """Build test protocols in their order. Raises ConfigError if there is none, or one cannot be built or scored."""
     built = [instantiate(protocol, trust=trust, only=Protocol) for protocol in protocols.values() if protocol]
     if not built:
         raise ConfigError("protocol: none is set. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")

@@ -34,10 +34,8 @@ def pretrained(name: str) -> Path:
     folders = list(spec.submodule_search_locations or []) if spec else []
     folder = next((path for root in folders if is_bundle(path := Path(root) / name)), None)
     if folder is None:
-        raise CheckpointError(
-            f"checkpoint: the weights of '{name}' are not part of this installation. Install hudepth again, or pass a "
-            "run or a file."
-        )
+        fix = "Install hudepth again, or pass a run or a file."
+        raise CheckpointError(f"checkpoint: the weights of '{name}' are not part of this installation. {fix}")
     return folder
 
 

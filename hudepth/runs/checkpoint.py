@@ -121,10 +121,6 @@ def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 def read_plain(path: Path) -> dict[str, Any]:
     """Read a file of plain types. Raises CheckpointError, without running code, for anything else."""
     _check_archive(path)
@@ -161,7 +157,7 @@ def _damaged(path: Path, error: Exception) -> CheckpointError:
 
 
 def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
-    """Read what :func:`find_checkpoint` finds. Raises CheckpointError if it is damaged, holds code, or is not ours."""
+    """Read what :func:`find_checkpoint` finds. Raises CheckpointError if it is damaged, unsafe, or not hudepth's."""
     path = find_checkpoint(spec, runs=runs)
     if bundles.is_bundle(path):
         own, tensors, size_bytes = bundles.read_bundle(path)
@@ -180,8 +176,9 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
             else "Use the version of hudepth that wrote it, or train again with this one."
         )
         raise CheckpointError(f"'{path}' has format version {own.get('version')}, this hudepth reads {VERSION}. {fix}")
-    config, split, data = own.get("config"), own.get("split"), own.get("data")
-    mappings = isinstance(config, dict) and all(isinstance(part, dict) for part in (config.get("model"), split, data))
+    parts: list[Any] = [own.get(key) for key in ("config", "split", "data")]
+    config, split, data = parts
+    mappings = all(isinstance(part, dict) for part in parts) and isinstance(config.get("model"), dict)
     if not (mappings and isinstance(epoch, int) and _is_state(tensors)):
         raise CheckpointError(f"'{path}' is incomplete: configuration, split, data, epoch or tensors are missing.")
     state = {n.removeprefix(NET_PREFIX): v for n, v in tensors.items() if n.startswith(NET_PREFIX)}

@@ -59,9 +59,8 @@ def paired(a: Result, b: Result) -> tuple[ImageTable, ImageTable]:
             "neither was trained on: hudepth-test checkpoint=<run> data=<name>."
         )
     if first.scenes != second.scenes or not np.array_equal(first.pixels, second.pixels):
-        raise DataError(
-            f"{where} have different scenes or pixel counts for the same images. Run hudepth-test on both again."
-        )
+        differ = "have different scenes or pixel counts for the same images"
+        raise DataError(f"{where} {differ}. Run hudepth-test on both again.")
     return a.table, second
 
 
@@ -87,10 +86,8 @@ def _check_conditions(a: Result, b: Result) -> str:
             "Test both on one data set: hudepth-test checkpoint=<run> data=<name>."
         )
     if lines:
-        raise DataError(
-            f"{where} were tested under different protocols ({_first(lines)}). "
-            "Run hudepth-test on both again with the same settings."
-        )
+        fix = "Run hudepth-test on both again with the same settings."
+        raise DataError(f"{where} were tested under different protocols ({_first(lines)}). {fix}")
     return where
 
 
@@ -129,14 +126,11 @@ def merge(results: Mapping[str, Result], *, metrics: Sequence[str], mark: bool =
             f"the results of '{name}' and '{other}' do not compare: {_first(lines)}. "
             "Run hudepth-test on them again with the same settings, or mark in the table what differs."
         )
-    return [
-        {
-            "name": name,
-            **{column: words[name] for column, words in marks.items()},
-            **{metric: result.metrics.get(metric, math.nan) for metric in metrics},
-        }
-        for name, result in results.items()
-    ]
+    rows: list[dict[str, str | float]] = []
+    for name, result in results.items():
+        known_values = {metric: result.metrics.get(metric, math.nan) for metric in metrics}
+        rows.append({"name": name, **{column: words[name] for column, words in marks.items()}, **known_values})
+    return rows
 
 
 def _marks(results: Mapping[str, Result]) -> dict[str, dict[str, str]]:

@@ -49,9 +49,8 @@ def _git() -> dict[str, Any] | None:
     here = Path(__file__).parent
 
     def ask(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(here), *words], capture_output=True, text=True, timeout=10, check=True
-        ).stdout.strip()
+        command = ["git", "-C", str(here), *words]
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
 
     try:
         if not ask("ls-files", Path(__file__).name):

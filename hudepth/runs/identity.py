@@ -61,16 +61,11 @@ def _normalise(value: Any) -> Any:
 
 
 def part_bound_to_length(config: Mapping[str, Any]) -> str:
-    """Name the part of a configuration that depends on the number of epochs, or return an empty string.
-
-    A run with such a part cannot be resumed with another ``trainer.max_epochs``.
-    """
+    """Name the part for which a run cannot be resumed with another ``trainer.max_epochs``; empty if there is none."""
     schedule = config["schedule"] or {}
     if "T_max" in schedule or str(schedule.get("_target_")).startswith("hudepth.training.schedules."):
         return "the learning-rate schedule"
     if config["data"].get("progressive"):
         return "the progressive resolution"
-    freezes = [
-        extra for extra in config["callbacks"].get("extra") or [] if "FreezeEncoder" in str(extra.get("_target_"))
-    ]
-    return "FreezeEncoder" if freezes else ""
+    extras = [str(extra.get("_target_")) for extra in config["callbacks"].get("extra") or []]
+    return "FreezeEncoder" if any("FreezeEncoder" in extra for extra in extras) else ""

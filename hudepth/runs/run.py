@@ -38,11 +38,9 @@ class Run:
     def read(cls, path: Path, *, labels: Mapping[str, str] | None = None) -> Run:
         """Read a run directory. Raises CheckpointError if it is not one."""
         config = read_config(path)
-        missing = [part for part in ("seed", "data", "model", "loss") if part not in config]
-        if missing:
-            raise CheckpointError(
-                f"'{path}' is not a run of hudepth-train: its config.yaml has no '{missing[0]}'. Pass a run directory."
-            )
+        if missing := [part for part in ("seed", "data", "model", "loss") if part not in config]:
+            why = f"its config.yaml has no '{missing[0]}'"
+            raise CheckpointError(f"'{path}' is not a run of hudepth-train: {why}. Pass a run directory.")
         return cls(path, config, *read_state(path), labels=dict(labels or {}))
 
     @property
@@ -92,10 +90,8 @@ def newest_run(runs: str | Path) -> Path:
     root = Path(runs).expanduser()
     found = [c.parent.parent for name in (BEST, LAST) for c in root.glob(f"*/*/{CHECKPOINTS}/{name}")]
     if not found:
-        raise CheckpointError(
-            f"checkpoint=last: no run with a checkpoint below '{root}'. Train one with hudepth-train, "
-            "or pass checkpoint=<file or run directory>."
-        )
+        fix = "Train one with hudepth-train, or pass checkpoint=<file or run directory>."
+        raise CheckpointError(f"checkpoint=last: no run with a checkpoint below '{root}'. {fix}")
     return max(found, key=lambda run: (run / CHECKPOINTS).stat().st_mtime_ns)
 
 

@@ -41,9 +41,8 @@ def create(parent: str | Path, name: str) -> Path:
         except OSError as error:
             if isinstance(error, FileExistsError) and path.exists():  # a dangling link above it also "exists"
                 continue
-            raise ConfigError(
-                f"paths.runs: cannot make '{path}' ({error.strerror}). Pass paths.runs=<a folder you can write to>."
-            ) from error
+            fix = "Pass paths.runs=<a folder you can write to>."
+            raise ConfigError(f"paths.runs: cannot make '{path}' ({error.strerror}). {fix}") from error
         return path.resolve()
     raise ConfigError(f"paths.runs: '{base}' has too many runs of this second. Start again.")
 
@@ -56,9 +55,8 @@ def write_start(
         _write_config(run, config, overrides)
         write_json(run / "environment.json", dict(environment))
     except OSError as error:
-        raise ConfigError(
-            f"'{run}' cannot be written ({error.strerror}). Pass paths.runs=<a folder you can write to>."
-        ) from error
+        fix = "Pass paths.runs=<a folder you can write to>."
+        raise ConfigError(f"'{run}' cannot be written ({error.strerror}). {fix}") from error
 
 
 def write_resumed(run: Path, *, config: Mapping[str, Any], overrides: Sequence[str]) -> None:

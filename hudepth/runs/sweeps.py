@@ -5,8 +5,6 @@
     <sweep_dir>/
       sweep.yaml         the jobs of each sweep that was run here, and what it varied
       <label>-<key>/     a run directory per job
-
-Nothing here depends on Hydra: ``hudepth.sweep`` runs sweeps, ``hudepth-report sweep`` reads them.
 """
 
 from __future__ import annotations

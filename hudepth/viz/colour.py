@@ -47,9 +47,7 @@ def colour_depth(
     picture = cv2.applyColorMap(shade, _colours())
     if not depth_m.all():
         picture[depth_m == 0] = UNMEASURED_GREY
-    if not legend:
-        return np.asarray(picture, np.uint8)
-    return np.hstack([picture, _legend(depth_m.shape[0], near, far)])
+    return np.hstack([picture, _legend(depth_m.shape[0], near, far)]) if legend else np.asarray(picture, np.uint8)
 
 
 @lru_cache(maxsize=1)

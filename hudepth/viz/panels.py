@@ -100,13 +100,10 @@ def _layout(rows: int, *, aspect: float) -> tuple[Figure, list[list[Axes]], list
         return figure.add_axes((x / width, y / height, w / width, h / height))
 
     x = [left + column * (cell + gap) for column in range(4)]
-    cells = [
-        [axes(x[c], height - top - (r + 1) * cell * aspect - r * gap, cell, cell * aspect) for c in range(4)]
-        for r in range(rows)
-    ]
+    ys = [height - top - (row + 1) * cell * aspect - row * gap for row in range(rows)]
+    cells = [[axes(each, y, cell, cell * aspect) for each in x] for y in ys]
     for axis in (axis for row in cells for axis in row):
-        axis.set_xticks([])
-        axis.set_yticks([])
+        axis.set(xticks=[], yticks=[])
     y = bottom - bar - 0.02
     inset = 0.2  # of a scale's ends from its columns
     bars = [axes(x[1] + inset, y, 2 * cell + gap - 2 * inset, bar), axes(x[3] + inset, y, cell - 2 * inset, bar)]
