@@ -39,7 +39,12 @@ def write_outputs(
     ``stamp`` is what else metrics.json states: data, split, checkpoint. Raises ConfigError if no pixel of any image
     counts.
     """
-    tables = _image_tables(protocol, evaluation, datamodule)
+    records = [datamodule.store.records[index] for index in evaluation.indices]
+    boundary = {MODEL: evaluation.boundary.get(protocol.name)}
+    tables = {
+        name: image_table(protocol, evaluation.sums[name, protocol.name], records, boundary=boundary.get(name))
+        for name in evaluation.predictors
+    }
     model = tables[MODEL]
     left_out = _left_out(protocol, model)
     metrics = {name: summarise(table, **protocol.summary_options) for name, table in tables.items()}
@@ -66,15 +71,6 @@ def write_outputs(
     over = f"{uncertainty['scenes']} {'scenes' if any(model.scenes) else 'images of unknown scenes'}"
     print_results(metrics, ranges[MODEL], over=over, title=title)
     return metrics
-
-
-def _image_tables(protocol: Protocol, evaluation: Evaluation, datamodule: DepthDataModule) -> dict[str, ImageTable]:
-    records = [datamodule.store.records[index] for index in evaluation.indices]
-    boundary = {MODEL: evaluation.boundary.get(protocol.name)}
-    return {
-        name: image_table(protocol, evaluation.sums[name, protocol.name], records, boundary=boundary.get(name))
-        for name in evaluation.predictors
-    }
 
 
 def _left_out(protocol: Protocol, table: ImageTable) -> list[str]:

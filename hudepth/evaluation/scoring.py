@@ -34,18 +34,16 @@ class BatchTruth:
 
         Raises ConfigError if the protocol needs native ground truth and the batch has none.
         """
-        return self._cache.get(protocol.needs_native, lambda: self._grids(protocol))
-
-    def _grids(self, protocol: Protocol) -> list[Grid]:
         batch = self._batch
         if not protocol.needs_native:
-            return [Grid(batch["unit_depth"] * self._max_depth_m, batch["valid"])]
+            return self._cache.get(False, lambda: [Grid(batch["unit_depth"] * self._max_depth_m, batch["valid"])])
         if "native_depth" not in batch:
             raise ConfigError(
                 f"protocol={protocol.name} scores at native resolution, which this store was prepared without. "
                 "Pass data.native=true, or protocol=paper."
             )
-        return [Grid(truth[None].to(batch["image"].device), truth[None] > 0) for truth in batch["native_depth"]]
+        device, truths = batch["image"].device, batch["native_depth"]
+        return self._cache.get(True, lambda: [Grid(truth[None].to(device), truth[None] > 0) for truth in truths])
 
 
 class BatchScores:
@@ -60,22 +58,17 @@ class BatchScores:
 
     def sums(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
         """Return a row of sums for each image: columns as in :data:`SUM_COLUMNS`, then registered metrics."""
-        rows = torch.cat([scored.sums(protocol) for scored in self._scored(protocol)])
-        return torch.cat([rows, *self._registered(protocol)], dim=1)
-
-    def _registered(self, protocol: Protocol) -> list[Tensor]:
-        """Compute metrics that were registered with a function, one column each."""
+        columns = [torch.cat([scored.sums(protocol) for scored in self._scored(protocol)])]
         functions = registered_functions().values()
         images = [*self._cropped(protocol)] if functions else []
-        return [
-            torch.cat([torch.where(x[2].any(dim=(1, 2, 3)), function(*x).double(), torch.nan) for x in images])[:, None]
-            for function in functions
-        ]
+        for function in functions:
+            values = [torch.where(x[2].any(dim=(1, 2, 3)), function(*x).double(), torch.nan) for x in images]
+            columns.append(torch.cat(values)[:, None])
+        return torch.cat(columns, dim=1)
 
     def boundary(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
         """Return the boundary metrics of each image, columns as in :data:`hudepth.metrics.boundary.BOUNDARY_NAMES`."""
-        rows = [torch.stack([*boundary_metrics(*x).values()], dim=1) for x in self._cropped(protocol)]
-        return torch.cat(rows)
+        return torch.cat([torch.stack([*boundary_metrics(*x).values()], dim=1) for x in self._cropped(protocol)])
 
     def strata(self, protocol: Protocol) -> Float64[Tensor, "b bins k"]:
         """Return the sums of each image over the bins of :data:`hudepth.metrics.strata.STRATA`."""

@@ -21,15 +21,14 @@ class PointCloud:
 
     def to_ply(self) -> bytes:
         """Return a binary PLY file (little-endian), whose comment states axes, unit and camera."""
-        kinds: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+        kinds = [(name, "<f4") for name in ("x", "y", "z")]
+        columns = list(self.points_m.T)
         if self.colours is not None:
-            kinds += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+            kinds += [(name, "u1") for name in ("red", "green", "blue")]
+            columns += list(self.colours.T)
         vertices = np.empty(len(self.points_m), dtype=kinds)
-        for axis, name in enumerate("xyz"):
-            vertices[name] = self.points_m[:, axis]
-        if self.colours is not None:
-            for channel, name in enumerate(("red", "green", "blue")):
-                vertices[name] = self.colours[:, channel]
+        for (name, _), values in zip(kinds, columns, strict=True):
+            vertices[name] = values
         types = {"<f4": "float", "u1": "uchar"}
         lines = [
             "ply", "format binary_little_endian 1.0",
