@@ -38,16 +38,10 @@ class ConstantDepth(Baseline):
 
 
 class NearestFrame(Baseline):
-    """Copies the depth of the most similar training image.
+    """Copies the depth of the most similar training image, ``fill`` where that is unmeasured.
 
-    Where it comes close to a network, test images have near duplicates in the training subset.
-
-    Args:
-        store: holds the depths.
-        train: positions of the training pairs in it.
-        descriptors: of the training images, as :func:`descriptor` makes them.
-        fill: unit depth where the copied depth is unmeasured, [1, 1, h, w].
-        max_depth_m: depth is clipped to it and divided by it.
+    Where it comes close to a network, test images have near duplicates in the training subset. ``train`` holds the
+    positions of the training pairs in the store, ``descriptors`` what :func:`descriptor` makes of their images.
     """
 
     descriptors: Tensor

@@ -90,13 +90,11 @@ class Scored:
         if protocol.alignment != "none":
             seen = (tuple(key or ()) for key in (protocol.crop, protocol.crop_size))
             return (protocol.alignment, *seen, protocol.caps), limits if protocol.clamp else None
-        clamps = protocol.clamp and not self._cache.get(("inside", limits), lambda: self._inside(protocol))
-        return None, limits if clamps else None
-
-    def _inside(self, protocol: Protocol) -> bool:
-        low, high = protocol.min_depth_m, protocol.max_depth_m
-        least, most = (x.item() for x in self.pred_m.aminmax())
-        return low <= least and (high is None or most <= high)
+        if not protocol.clamp:
+            return None, None
+        least, most = self._cache.get("range", lambda: [x.item() for x in self.pred_m.aminmax()])
+        inside = limits[0] <= least and (limits[1] is None or most <= limits[1])
+        return None, None if inside else limits
 
     def _prediction(self, protocol: Protocol) -> Tensor:
         pred_m = self.pred_m
@@ -120,12 +118,12 @@ class Scored:
         top, left = rows.start, columns.start
         inside = slice(top, top + height - size + 1), slice(left, left + width - size + 1)
         whole = self.grid.windows(protocol)[..., *inside]
+
+        def compute() -> Tensor:
+            both = [torch.where(measured, depth_m, 0.0) for depth_m in (self.prediction(protocol), self.grid.depth_m)]
+            return ssim_map(*both, data_range=protocol.ssim_data_range_m, window=size)
+
         key = ("ssim", size, protocol.ssim_data_range_m, *self._variant(protocol))
-        values = self._cache.get(key, lambda: self._ssim_map(protocol))[..., *inside]
+        values = self._cache.get(key, compute)[..., *inside]
         total = torch.where(whole, values, 0.0).sum(dim=(1, 2, 3)).double()
         return total / whole.sum(dim=(1, 2, 3))
-
-    def _ssim_map(self, protocol: Protocol) -> Tensor:
-        both = self.prediction(protocol), self.grid.depth_m
-        pred_m, truth_m = (torch.where(self.grid.measured, depth_m, 0.0) for depth_m in both)
-        return ssim_map(pred_m, truth_m, data_range=protocol.ssim_data_range_m, window=protocol.ssim_window)

@@ -18,8 +18,6 @@ def build_protocols(protocols: Mapping[str, Any], *, datamodule: DepthDataModule
         raise ConfigError("protocol: none is set. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
     native = [protocol.name for protocol in built if protocol.needs_native]
     if native and not datamodule.native:
-        raise ConfigError(
-            f"protocol={native[0]} scores at native resolution, which data.native=false leaves out. "
-            "Pass data.native=true, or protocol=paper."
-        )
+        why = "scores at native resolution, which data.native=false leaves out"
+        raise ConfigError(f"protocol={native[0]} {why}. Pass data.native=true, or protocol=paper.")
     return built

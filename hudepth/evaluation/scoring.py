@@ -38,10 +38,8 @@ class BatchTruth:
         if not protocol.needs_native:
             return self._cache.get(False, lambda: [Grid(batch["unit_depth"] * self._max_depth_m, batch["valid"])])
         if "native_depth" not in batch:
-            raise ConfigError(
-                f"protocol={protocol.name} scores at native resolution, which this store was prepared without. "
-                "Pass data.native=true, or protocol=paper."
-            )
+            why = "scores at native resolution, which this store was prepared without"
+            raise ConfigError(f"protocol={protocol.name} {why}. Pass data.native=true, or protocol=paper.")
         device, truths = batch["image"].device, batch["native_depth"]
         return self._cache.get(True, lambda: [Grid(truth[None].to(device), truth[None] > 0) for truth in truths])
 
@@ -109,10 +107,7 @@ def image_table(
     *,
     boundary: Float64[Tensor, "n e"] | None = None,
 ) -> ImageTable:
-    """Turn rows of :meth:`BatchScores.sums` and :meth:`BatchScores.boundary` into the metrics of each image.
-
-    ``records`` are the pairs of the rows.
-    """
+    """Turn rows of :meth:`BatchScores.sums` and :meth:`BatchScores.boundary` into the metrics of each image."""
     columns = dict(zip((*SUM_COLUMNS, *registered_functions()), sums.T, strict=True))
     others = {name: columns.pop(name) for name in ("ssim", *registered_functions())}
     values = depth_metrics_from_sums(columns, silog_lambda=protocol.silog_lambda, silog_factor=protocol.silog_factor)

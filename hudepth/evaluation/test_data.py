@@ -18,13 +18,9 @@ def open_data(
 ) -> tuple[DepthDataModule, bool]:
     """Return the data to test a checkpoint on, and whether data set or split differ from those of the training.
 
-    Raises HudepthError if it cannot be built, or if test pairs were trained on.
-
-    Args:
-        checkpoint: states what it was trained on.
-        overrides: keys of ``data`` that replace the checkpoint's; with ``_target_``, another data set.
-        typed: command-line overrides, which tell a chosen size from the data set's default.
-        trust: packages whose classes the configuration may name.
+    ``overrides`` replace keys of the checkpoint's ``data``, or with ``_target_`` all of it; ``typed`` are the
+    command-line overrides, which tell a chosen size from the data set's default. Raises HudepthError if the data cannot
+    be built, or if test pairs were trained on.
     """
     datamodule = build_data(_data_config(checkpoint, overrides, typed), trust=trust)
     other_data = "_target_" in overrides or any(key.startswith(("split", "fractions")) for key in overrides)
@@ -46,10 +42,8 @@ def _data_config(checkpoint: Checkpoint, overrides: Mapping[str, Any], typed: Se
         data = {**overrides, **{key: trained[key] for key in kept}}
     else:
         if unknown := [key for key in overrides if key not in trained]:
-            raise ConfigError(
-                f"data.{unknown[0]}: the checkpoint's data has no such key.{did_you_mean(unknown[0], trained)} "
-                "To test on another data set pass data=<name>."
-            )
+            hint = f"{did_you_mean(unknown[0], trained)} To test on another data set pass data=<name>."
+            raise ConfigError(f"data.{unknown[0]}: the checkpoint's data has no such key.{hint}")
         data = {**trained, **overrides, "source": {**trained.get("source", {}), **overrides.get("source", {})}}
     if (before_m := trained.get("max_depth_m")) != (now_m := data.get("max_depth_m")):
         raise ConfigError(

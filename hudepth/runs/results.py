@@ -80,10 +80,8 @@ def find_result(run_or_folder: str | Path, protocol: str) -> Result:
     if found is None:
         others = {file.parent.name for pattern in ("test/*", "*") for file in folder.glob(f"{pattern}/{METRICS}")}
         there = f" It holds {', '.join(sorted(others))}.{did_you_mean(protocol, others)}" if others else ""
-        raise DataError(
-            f"'{folder}' holds no test result of protocol '{protocol}'.{there} "
-            f"Run hudepth-test checkpoint={folder} protocol={protocol}."
-        )
+        fix = f"Run hudepth-test checkpoint={folder} protocol={protocol}."
+        raise DataError(f"'{folder}' holds no test result of protocol '{protocol}'.{there} {fix}")
     result = _read(found)
     if (name := result.protocol_name) != protocol:
         raise DataError(f"'{found}' is a test result of protocol '{name}', not of '{protocol}'. Pass protocol={name}.")
@@ -123,10 +121,8 @@ def _read(folder: Path) -> Result:
     for name in CHECKED:
         stated, got = metrics.get(name, math.nan), means.get(name, math.nan)
         if math.isfinite(stated) and not math.isclose(stated, got, rel_tol=1e-4):
-            raise DataError(
-                f"'{per_image}' gives {name} {got:.6g}, but {METRICS} states {stated:.6g}: "
-                f"they are not from the same test. {_AGAIN}"
-            )
+            why = f"gives {name} {got:.6g}, but {METRICS} states {stated:.6g}: they are not from the same test"
+            raise DataError(f"'{per_image}' {why}. {_AGAIN}")
     return result
 
 

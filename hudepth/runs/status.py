@@ -42,10 +42,7 @@ def read_status(run: Path) -> dict[str, Any]:
 
 
 def read_state(run: Path) -> tuple[str, str]:
-    """Return the state of a run, and the error message if it failed.
-
-    A run whose status is ``running`` but that no process has locked was killed: it is ``interrupted``.
-    """
+    """Return the state of a run, and its error message; one that is ``running`` but not locked is ``interrupted``."""
     status = read_status(run)
     state = str(status.get("state"))
     if state == RUNNING and _is_locked(run):
