@@ -45,17 +45,10 @@ def search(
 ) -> None:
     """Run trials until there are as many as asked for; trials that were killed are resumed first.
 
-    Args:
-        compose: returns jobs with their configurations.
-        run_jobs: records all jobs so far, then runs the unfinished ones of the second argument.
-        folder: of the sweep; the study lies in it.
-        overrides: of the sweep and of the command line; those with a range of values are searched over.
-        options: of the search.
-        mode: ``min`` or ``max``: which way the metric ``monitor`` is better.
-        monitor: the metric.
-        at_once: number of trials in parallel.
-
-    Raises ConfigError if optuna is not installed, nothing is searched over, or all trials failed.
+    ``compose`` returns jobs with their configurations; ``run_jobs`` records all jobs so far, then runs the unfinished
+    ones of its second argument. The study lies in ``folder``. Overrides with a range of values are searched over.
+    ``mode`` is ``min`` or ``max``: which way ``monitor`` is better; ``at_once`` trials run in parallel. Raises
+    ConfigError if optuna is not installed, nothing is searched over, or all trials failed.
     """
     constants = [str(override.input_line) for override in overrides if not override.is_sweep_override()]
     space = {each.get_key_element(): distribution(each) for each in overrides if each.is_sweep_override()}

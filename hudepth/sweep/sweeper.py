@@ -1,7 +1,6 @@
 """Hydra's sweeper for hudepth: runs the jobs that are not finished, and survives those that fail.
 
-Hydra parses and composes, its launchers (basic, joblib, submitit, ray) run the jobs. This module decides which jobs
-there are and where each is stored, and reports the outcome.
+Hydra's launchers (basic, joblib, submitit, ray) run the jobs; this module decides which there are, and reports.
 """
 
 from __future__ import annotations
@@ -34,6 +33,8 @@ from hudepth.runs.sweeps import read_jobs, write_jobs
 from hudepth.sweep.jobs import Job, combine, compose, find_done, merge_overrides
 from hudepth.sweep.progress import Progress, say
 
+Part = Mapping[str, Any] | None
+
 
 class Sweep(Sweeper):
     """Runs the jobs of ``-m`` and of ``+sweep=<name>``.
@@ -42,12 +43,7 @@ class Sweep(Sweeper):
     by a search, see :class:`hudepth.sweep.search.SearchOptions`.
     """
 
-    def __init__(
-        self,
-        params: Mapping[str, Any] | None = None,
-        variants: Mapping[str, Any] | None = None,
-        search: Mapping[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, params: Part = None, variants: Part = None, search: Part = None) -> None:
         super().__init__()
         self.params, self.search = dict(params or {}), dict(search or {})
         self.variants = {str(name): list(map(str, each or ())) for name, each in (variants or {}).items()}
@@ -109,9 +105,8 @@ class Sweep(Sweeper):
         if failed:
             more = f"; {len(failed) - 3} more" if len(failed) > 3 else ""
             errors = "; ".join(line.rstrip(".") for line in failed[:3])
-            raise ConfigError(
-                f"{len(failed)} of {len(jobs)} jobs failed: {errors}{more}. See {_format_path(folder)}/*/train.log."
-            )
+            logs = f"{_format_path(folder)}/*/train.log"
+            raise ConfigError(f"{len(failed)} of {len(jobs)} jobs failed: {errors}{more}. See {logs}.")
         if unfinished:
             raise ConfigError(f"{unfinished} of {len(jobs)} jobs did not end. Resume them with the command above.")
 

@@ -81,11 +81,8 @@ def _new(cfg: DictConfig) -> Training:
 def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
     """Return the configuration of a run to resume, with command-line overrides like ``trainer.max_epochs=50``.
 
-    The run directory may come from somebody else, so only ``trust=`` on the command line counts.
-
-    Raises:
-        CheckpointError: if it is not a run, or has no checkpoint to resume from.
-        ConfigError: if an override cannot change any more.
+    The run directory may come from somebody else, so only ``trust=`` on the command line counts. Raises CheckpointError
+    if it is not a run or has no checkpoint to resume from, ConfigError if an override cannot change any more.
     """
     config = read_config(path)
     if lacking := [part for part in PARTS if part not in config]:

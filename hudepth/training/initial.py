@@ -57,9 +57,8 @@ def restore_parents(training: Training, net: nn.Module, data: DepthDataModule) -
 def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataModule) -> Parents:
     """Load the weights of ``config["init"]`` into a network; return what they were trained on.
 
-    Raises:
-        CheckpointError: if there is no such checkpoint, or it belongs to another network.
-        DataError: if it was trained on pairs that this training validates or tests on.
+    Raises CheckpointError if there is no such checkpoint or it belongs to another network, DataError if it was trained
+    on pairs that this training validates or tests on.
     """
     checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"])
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))

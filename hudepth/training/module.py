@@ -167,9 +167,9 @@ class DepthModule(LightningModule):
 
     def _last_good(self) -> str:
         """Name the last checkpoint, which was written before anything became NaN."""
-        paths = [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]
-        found = f"The last good checkpoint is '{paths[-1]}', of epoch {self.current_epoch}." if paths else ""
-        return found or "No epoch was finished, so there is no checkpoint."
+        if paths := [path for c in self.trainer.checkpoint_callbacks if (path := getattr(c, "best_model_path", ""))]:
+            return f"The last good checkpoint is '{paths[-1]}', of epoch {self.current_epoch}."
+        return "No epoch was finished, so there is no checkpoint."
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, the schedule."""

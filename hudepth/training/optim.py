@@ -17,13 +17,9 @@ class GroupedAdamW(AdamW):
 
     Groups are named ``encoder``, ``encoder_no_decay``, ``rest`` and ``rest_no_decay``; empty ones are left out.
 
-    Args:
-        params: parameters with their names.
-        lr: learning rate of all but the encoder.
-        encoder: whose parameters get a rate of their own; None if the network has no encoder.
-        encoder_lr_factor: the encoder's learning rate over ``lr``, finite and not negative; 0 leaves it unchanged.
-        weight_decay: of matrices and kernels.
-        **options: further arguments of :class:`torch.optim.AdamW`, for example ``fused``.
+    ``encoder_lr_factor`` is the encoder's learning rate over ``lr``, finite and not negative, else a ConfigError is
+    raised; 0 leaves the encoder unchanged. ``weight_decay`` applies to matrices and kernels. ``options`` are further
+    arguments of :class:`torch.optim.AdamW`, for example ``fused``.
     """
 
     def __init__(

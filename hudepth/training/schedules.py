@@ -15,10 +15,8 @@ from hudepth.base.errors import ConfigError
 class StepSchedule(LambdaLR):
     """Multiplies the learning rate of each group by a function of the finished share of the training.
 
-    ``warmup``, in [0, 1), is the share of the training in which the factor rises linearly from 0 to 1.
-
-    Raises:
-        ConfigError: if ``warmup`` is out of range, or the training has no end.
+    ``warmup``, in [0, 1), is the share of the training in which the factor rises linearly from 0 to 1. Raises
+    ConfigError if it is out of range, or the training has no end.
     """
 
     def __init__(self, optimizer: Optimizer, *, total_steps: int, warmup: float = 0.0) -> None:
