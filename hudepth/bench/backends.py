@@ -15,15 +15,13 @@ ONNX, INT8 = "model.onnx", "int8.xml"
 
 @dataclass(frozen=True)
 class Backend:
-    """A way to run the network."""
+    """A way to run the network; ``extras`` of hudepth install its ``packages``."""
 
     factory: str
     """``module:function`` that makes its runner."""
     about: str
-    """For the notes."""
     packages: tuple[str, ...] = ()
     extras: str = ""
-    """Extras of hudepth that install ``packages``."""
     graph: str | None = None
     """The file that must be exported for it."""
     options: dict[str, Any] = field(default_factory=dict)

@@ -64,10 +64,8 @@ def export(spec: Spec) -> GraphRunner:
     from hudepth.models.cost import parameters
 
     net, options = build_merged(spec), spec.options
-    info = ModelInfo(
-        name=options["name"], size=options["size"], max_depth_m=options["max_depth_m"],
-        parameters=parameters(net, trainable_only=False), epoch=0, processing=False,
-    )  # fmt: skip
+    stated = {key: options[key] for key in ("name", "size", "max_depth_m")}
+    info = ModelInfo(**stated, parameters=parameters(net, trainable_only=False), epoch=0, processing=False)
     export_onnx(net, Path(options["graph"]), info=info)
     return GraphRunner(np.asarray)
 
@@ -79,9 +77,7 @@ def quantise(spec: Spec) -> GraphRunner:
     nncf: Any = importlib.import_module("nncf")
     nncf.set_log_level(logging.ERROR)
     images = np.load(spec.images)
-    quantised = nncf.quantize(
-        library.Core().read_model(spec.options["onnx"]), nncf.Dataset([image[None] for image in images]),
-        preset=nncf.QuantizationPreset.MIXED, subset_size=len(images),
-    )  # fmt: skip
+    graph, data = library.Core().read_model(spec.options["onnx"]), nncf.Dataset([image[None] for image in images])
+    quantised = nncf.quantize(graph, data, preset=nncf.QuantizationPreset.MIXED, subset_size=len(images))
     library.save_model(quantised, spec.options["graph"], compress_to_fp16=False)
     return GraphRunner(np.asarray)

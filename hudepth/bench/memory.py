@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 CLEAR_REFS = Path("/proc/self/clear_refs")
@@ -21,12 +22,9 @@ def reset_peak() -> bool:
 
 def peak_mb() -> float:
     """Return the peak resident memory [MB] since :func:`reset_peak`, or since the start if that is not supported."""
-    try:
-        found = re.search(r"^VmHWM:\s*(\d+) kB$", STATUS.read_text(encoding="ascii"), re.MULTILINE)
-    except OSError:
-        found = None
-    if found:
-        return int(found[1]) * 1024 / 1e6
+    with suppress(OSError):
+        if found := re.search(r"^VmHWM:\s*(\d+) kB$", STATUS.read_text(encoding="ascii"), re.MULTILINE):
+            return int(found[1]) * 1024 / 1e6
     import resource
 
     unit = 1 if sys.platform == "darwin" else 1024

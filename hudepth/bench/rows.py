@@ -79,10 +79,9 @@ def make_rows(
     maximum depth [m]: the network predicts depth / max_depth_m.
     """
     by_place = {(sample.batch, sample.name): sample for sample in samples}
-    batches = sorted({sample.batch for sample in samples})
     return [
         _row(by_place[place], entry, by_place.get((batch, REFERENCE)), peak_gflop_per_s, max_depth_m)
-        for batch in batches
+        for batch in sorted({sample.batch for sample in samples})
         for entry in entries
         if (place := (batch, entry.name)) in by_place
     ]

@@ -110,8 +110,7 @@ def build_net(spec: Spec) -> nn.Module:
 
 def build_merged(spec: Spec) -> nn.Module:
     """Build the merged network."""
-    height, width = spec.options["size"]
-    return inference_form(build_net(spec), size=(height, width))
+    return inference_form(build_net(spec), size=spec.options["size"])
 
 
 def _device(spec: Spec) -> torch.device:

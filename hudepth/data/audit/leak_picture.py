@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 COLOURS = {"near": "tab:red", "scene": "tab:orange", "other": "0.35"}
-"""Of the verdict: near duplicates, images of one scene, and others."""
 
 
 @dataclass(frozen=True)
