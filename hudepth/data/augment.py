@@ -43,8 +43,7 @@ class Augmentation:
         cut_depth: probability of showing the ground truth in a box of the image.
         cut_depth_size: largest share of what is right of and below the box's corner that the box takes.
 
-    Raises:
-        ConfigError: for values out of range.
+    Raises ConfigError for values out of range.
     """
 
     flip: _Share = 0.0
@@ -84,12 +83,12 @@ class Augmentation:
         aspect: float,
         generator: torch.Generator,
     ) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
-        """Change a batch.
+        """Change a batch and resize it to ``size``.
 
         Args:
             image: RGB in [0, 1].
             unit_depth: depth / max_depth_m, not clipped, 0 where unmeasured: the ground truth, then a teacher's depth.
-            size: (height, width) of the result.
+            size: (height, width).
             aspect: width over height of the scene.
             generator: of the CPU, whatever device the batch is on: the same draws everywhere.
         """
@@ -131,12 +130,8 @@ class Augmentation:
         zoom = torch.where(draw.chance(self.zoom_chance), draw.log_uniform(*self.zoom), 1.0)
         room = 1 - 1 / zoom
         angle = math.radians(self.rotate_deg)
-        return Geometry(
-            zoom=zoom,
-            centre=torch.stack([room * draw.uniform(-1, 1), room * draw.uniform(-1, 1)], dim=1),
-            angle=draw.uniform(-angle, angle),
-            flip=draw.chance(self.flip),
-        )
+        centre = torch.stack([room * draw.uniform(-1, 1), room * draw.uniform(-1, 1)], dim=1)
+        return Geometry(zoom, centre, angle=draw.uniform(-angle, angle), flip=draw.chance(self.flip))
 
     def _draw_box(self, draw: _Draw) -> Tensor:
         shown = draw.chance(self.cut_depth)

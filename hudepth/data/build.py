@@ -17,15 +17,9 @@ _SOURCE_KEYS = ("root", "encoding")  # of the source, but next to it in the conf
 def build_data(
     data: Mapping[str, Any], *, trust: list[str], augment: Mapping[str, Any] | None = None
 ) -> DepthDataModule:
-    """Build the data module of a configuration.
+    """Build the data module of a configuration's part ``data``, and ``augment``, which only training uses.
 
-    Args:
-        data: its part ``data``.
-        trust: further modules whose classes may be named.
-        augment: its part ``augment``; only training uses it.
-
-    Raises:
-        ConfigError: if it cannot be built.
+    ``trust`` lists further modules whose classes may be named. Raises ConfigError if it cannot be built.
     """
     if not isinstance(data.get("source"), Mapping):
         raise ConfigError("data.source is not set. Choose a data set with data=<name>.")

@@ -27,15 +27,8 @@ def change_colours(
     """Change the colours of images in [0, 1] by factors per image; 1 changes nothing.
 
     In this order: x ** gamma, times brightness and tint, away from the image's mean by contrast, away from grey by
-    saturation; the result is clipped to [0, 1].
-
-    Args:
-        image: RGB in [0, 1].
-        gamma: exponent.
-        brightness: factor.
-        contrast: factor of the difference from the mean luma of the image.
-        saturation: factor of the difference from each pixel's luma.
-        tint: factor of each channel.
+    saturation; the result is clipped to [0, 1]. Contrast scales the difference from the image's mean luma, saturation
+    that from each pixel's luma.
     """
     image = image.clamp(1e-4, 1).pow_(gamma[:, None, None, None])
     # The rest is linear in the colours of a pixel: one matrix and one offset per image.
@@ -53,12 +46,9 @@ def change_colours(
 def blur(
     image: Float[Tensor, "b c h w"], sigma: Float[Tensor, " b"], *, largest: float = MAX_BLUR
 ) -> Float[Tensor, "b c h w"]:
-    """Blur each image by a Gaussian of its own standard deviation.
+    """Blur each image by a Gaussian of its own standard deviation ``sigma`` [pixels]; 0 changes nothing.
 
-    Args:
-        image: in any unit.
-        sigma: standard deviations [pixels]; 0 changes nothing.
-        largest: upper bound of sigma; the Gaussians are cut off at twice this.
+    ``largest`` is an upper bound of sigma; the Gaussians are cut off at twice this.
     """
     radius = math.ceil(2 * largest)
     taps = torch.arange(-radius, radius + 1, device=image.device, dtype=image.dtype)
@@ -77,10 +67,8 @@ def cut_depth(
 ) -> Float[Tensor, "b 3 h w"]:
     """Replace a box of each image by its ground truth, as grey in [0, 1] (CutDepth, Ishii and Yamashita 2021).
 
-    Args:
-        image: RGB in [0, 1].
-        unit_depth: in [0, 1], 0 where unmeasured: there the image is kept.
-        box: left, top, right, bottom as shares of the image's sides; an empty box changes nothing.
+    Where ``unit_depth`` (in [0, 1]) is 0, unmeasured, the image is kept. A box is left, top, right and bottom as shares
+    of the image's sides; an empty one changes nothing.
     """
     height, width = image.shape[-2:]
     y = (torch.arange(height, device=image.device) + 0.5)[:, None] / height

@@ -28,14 +28,7 @@ class DataOptions:
 
 
 def data(config: dict[str, Any]) -> None:
-    """Run the verb ``prepare``, ``info`` or ``audit``.
-
-    Args:
-        config: conf/data.yaml with command-line overrides.
-
-    Raises:
-        HudepthError: with one line for the user.
-    """
+    """Run the verb ``prepare``, ``info`` or ``audit``; HudepthError has one line for the user."""
     options = parse(DataOptions, config)
     datamodule = build_data(options.data, trust=options.trust)
     if options.verb == "audit":

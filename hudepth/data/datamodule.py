@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from torch.nn import functional
-from torch.utils.data import DataLoader, DistributedSampler, Sampler
+from torch.utils.data import DataLoader, DistributedSampler
 
 from hudepth.base.options import Range, Size, convert
 from hudepth.base.types import Batch, RawBatch
@@ -35,27 +35,20 @@ class DepthDataModule(LightningDataModule):
     Args:
         source: the data set.
         size: (height, width) of training images, or one number for a square; the paper's is 224 x 224.
-        split: ``random`` (the paper), ``scene`` or ``official``; see :func:`hudepth.data.splits.make_split`.
-        split_seed: seed of the split (the paper: 42).
-        fractions: of train, val and test (the paper: 70 / 10 / 20 %).
+        split, split_seed, fractions: see :func:`hudepth.data.splits.make_split`; by default the paper's.
         max_depth_m: maximum depth [m] (the paper: 10); depth is clipped to it and divided by it.
         batch_size: pairs per step (the paper: 8).
         progressive: smaller sizes to start with, each until a share of the epochs:
             ``[{size: [112, 112], until: 0.4}]``; see :func:`hudepth.data.resolution.read_stages`.
         augment: random changes of training pairs.
-        teacher: folder of another model's depths of the training images; see
-            :class:`hudepth.data.teacher.TeacherDepths`.
+        teacher: folder of another model's depths; see :class:`hudepth.data.teacher.TeacherDepths`.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
         seed: of the order of training pairs and of augmentation, which depend only on it and the epoch.
         shuffle_block: for stores larger than memory: shuffle blocks of so many neighbouring pairs, then the pairs
             within a few blocks; see :class:`hudepth.data.dataset.BlockShuffle`.
-        cache: folder of the depth stores.
-        native: keep native-resolution ground truth in the store, for protocols like ``eigen``.
-        on_error: ``raise`` at a bad pair or ``skip`` it.
-        prepare_workers: processes that prepare the store; one per core by default.
+        cache, native, on_error, prepare_workers: of the depth store; see :func:`hudepth.data.prepare.prepare`.
 
-    Raises:
-        ConfigError: for values out of range.
+    Raises ConfigError for values out of range.
     """
 
     def __init__(
@@ -95,44 +88,26 @@ class DepthDataModule(LightningDataModule):
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
         self.cache = Path(cache)
-        self._store: DepthStore | None = None
-        self._split: Split | None = None
-        self._teacher: TeacherDepths | None = None
         self._draws: tuple[int, torch.Generator] | None = None
 
-    @property
+    @cached_property
     def store(self) -> DepthStore:
         """The depth store, prepared if necessary."""
-        if self._store is None:
-            self._store = prepare(
-                self.source,
-                size=self.size,
-                cache=self.cache,
-                native=self.native,
-                on_error=self.on_error,
-                workers=self.prepare_workers,
-            )
-        return self._store
+        return prepare(
+            self.source, size=self.size, cache=self.cache, native=self.native, on_error=self.on_error,
+            workers=self.prepare_workers,
+        )  # fmt: skip
 
-    @property
+    @cached_property
     def split(self) -> Split:
         """Which pairs of the store train, validate and test; assign one read from a split.json to use it instead."""
-        if self._split is None:
-            self._split = make_split(
-                self.store.records, kind=self.split_kind, seed=self.split_seed, fractions=self.fractions
-            )
-        return self._split
+        records = self.store.records
+        return make_split(records, kind=self.split_kind, seed=self.split_seed, fractions=self.fractions)
 
-    @split.setter
-    def split(self, split: Split) -> None:
-        self._split = split
-
-    @property
+    @cached_property
     def teacher(self) -> TeacherDepths | None:
         """The teacher's depths of the training pairs, prepared if necessary; None without a teacher."""
-        if self._teacher is None and self.teacher_folder is not None:
-            self._teacher = TeacherDepths(self.teacher_folder, self.store, self.split.train)
-        return self._teacher
+        return self.teacher_folder and TeacherDepths(self.teacher_folder, self.store, self.split.train)
 
     def prepare_data(self) -> None:
         """Build the depth store and read the teacher's depths."""
@@ -143,14 +118,12 @@ class DepthDataModule(LightningDataModule):
         rank, world_size = self._shard()
         dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
         # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees the same order.
-        sampler: Sampler[int] = DistributedSampler(
-            dataset, num_replicas=world_size, rank=rank, shuffle=True, seed=self.seed
-        )
-        if self.shuffle_block:
-            sampler = BlockShuffle(
-                dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
-                read_ahead=self.store.read_ahead,
-            )  # fmt: skip
+        if self.shuffle_block is None:
+            return self._loader(dataset, DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed))
+        sampler = BlockShuffle(
+            dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
+            read_ahead=self.store.read_ahead,
+        )  # fmt: skip
         return self._loader(dataset, sampler)
 
     def val_dataloader(self) -> DataLoader[RawBatch]:
@@ -207,14 +180,9 @@ class DepthDataModule(LightningDataModule):
 
     def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
         return DataLoader(
-            dataset,
-            batch_size=self.batch_size,
-            sampler=sampler,
-            num_workers=self.num_workers,
-            collate_fn=as_is,
-            pin_memory=torch.cuda.is_available(),
-            persistent_workers=self.num_workers > 0,
-        )
+            dataset, self.batch_size, sampler=sampler, num_workers=self.num_workers, collate_fn=as_is,
+            pin_memory=torch.cuda.is_available(), persistent_workers=self.num_workers > 0,
+        )  # fmt: skip
 
     def _shard(self) -> tuple[int, int]:
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)

@@ -15,29 +15,16 @@ from hudepth.data.teacher import TeacherDepths
 
 
 class StoreDataset(Dataset[RawBatch]):
-    """Some pairs of a depth store.
+    """Some pairs of a depth store, by their positions: also the native ground truth or a teacher's depths on request.
 
     It is asked for whole batches (``__getitems__``), so that pixels are read straight into the batch's memory.
-
-    Args:
-        store: where the pairs lie.
-        indices: which of them, as positions in the store.
-        native: also read the ground truth at its native resolution.
-        teacher: also read a teacher's depths.
     """
 
     def __init__(
-        self,
-        store: DepthStore,
-        indices: Sequence[int],
-        *,
-        native: bool = False,
-        teacher: TeacherDepths | None = None,
+        self, store: DepthStore, indices: Sequence[int], *, native: bool = False, teacher: TeacherDepths | None = None
     ) -> None:
-        self.store = store
-        self.indices = list(indices)
-        self.native = native
-        self.teacher = teacher
+        self.store, self.indices = store, list(indices)
+        self.native, self.teacher = native, teacher
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -64,10 +51,7 @@ def as_is(batch: Any) -> Any:
 
 
 class ShardSampler(Sampler[int]):
-    """Every ``world_size``-th position, in order and without padding, so that sums over processes stay exact.
-
-    (torch's DistributedSampler repeats samples to make all shards equally long, which evaluation must not.)
-    """
+    """Every ``world_size``-th position, in order and without the repetitions of torch's DistributedSampler."""
 
     def __init__(self, length: int, *, rank: int, world_size: int) -> None:
         self._positions = range(rank, length, world_size)
@@ -90,9 +74,6 @@ class BlockShuffle(Sampler[int]):
     Args:
         rows: position of each pair in the store.
         block: number of neighbouring pairs that are read together.
-        seed: of the order.
-        rank: of this process.
-        world_size: number of processes.
         group: number of blocks whose pairs are mixed; they are in memory at once.
         read_ahead: called with the first and last row of each block before its pairs are read.
     """
@@ -103,8 +84,7 @@ class BlockShuffle(Sampler[int]):
     ) -> None:  # fmt: skip
         self.rows = np.asarray(rows)
         self.block, self.seed, self.rank, self.world_size, self.group = block, seed, rank, world_size, group
-        self.read_ahead = read_ahead
-        self.epoch = 0
+        self.read_ahead, self.epoch = read_ahead, 0
 
     def set_epoch(self, epoch: int) -> None:
         """Take another order; Lightning calls this."""

@@ -47,11 +47,8 @@ def resolve_encoding(
         dtype: of the stored values.
         has_scale: whether the record has a scale of its own; if so, ``auto`` is ``linear``.
         auto_uint8: encoding of 8-bit values in this source; None if only the user can know.
-        where: names the file in errors.
 
-    Raises:
-        ConfigError: if the name is unknown.
-        DataError: if the type of the values does not determine the encoding.
+    Raises ConfigError if the name is unknown; DataError, of the file ``where``, if ``dtype`` does not determine it.
     """
     convert("data.encoding", encoding, Encoding)
     if encoding != "auto":
@@ -86,23 +83,13 @@ def to_metres(
     NaN, infinite, negative and zero depths count as unmeasured. A stored 0 is unmeasured too, except under
     ``linear``, where 0 is a value like any other.
 
-    Args:
-        raw: [H, W] stored values.
-        encoding: one of :data:`ENCODINGS`.
-        scale_m: metres per unit of the stored value, for ``linear``.
-        offset: in units of the stored value, for ``linear``.
-        auto_uint8: see :func:`resolve_encoding`.
-        where: names the file in errors.
-
-    Raises:
-        ConfigError: if the encoding is unknown.
-        DataError: if the values do not fit the encoding, or ``linear`` has no usable scale.
+    ``scale_m`` is in metres per unit of the stored value, ``offset`` in such units; ``where`` names the file in errors.
+    Raises ConfigError if the encoding is unknown; DataError if the values do not fit it, or ``linear`` has no scale.
     """
     if raw.ndim != 2:
         raise DataError(f"{_prefix(where)}depth has shape {raw.shape}. Store one value per pixel, as [H, W].")
-    name = resolve_encoding(
-        encoding, dtype=raw.dtype, has_scale=scale_m is not None, auto_uint8=auto_uint8, where=where
-    )
+    has_scale = scale_m is not None
+    name = resolve_encoding(encoding, dtype=raw.dtype, has_scale=has_scale, auto_uint8=auto_uint8, where=where)
     _check_values(raw, name, where)
     values = raw.astype(np.float64)  # float64: one rounding, at the end
     if name == "linear":
@@ -118,35 +105,26 @@ def to_metres(
 
 
 def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str) -> DepthRange:
-    """Measure the range of a sample of depths, and refuse an indoor set whose median is implausible for a room.
+    """Measure the range of a sample of depths [H, W] in metres, 0 where unmeasured.
 
-    Args:
-        depths: [H, W] arrays [m], 0 where unmeasured.
-        indoor: whether the set shows rooms.
-        encoding: the set's encoding; ``paper_literal`` is accepted, it is implausible on purpose.
-        name: of the set, for errors.
-
-    Raises:
-        DataError: if nothing is measured, or the median is outside :data:`INDOOR_MEDIAN_M`.
+    Raises DataError if nothing is measured, or an indoor set's median is outside :data:`INDOOR_MEDIAN_M`, except under
+    ``paper_literal``, which is implausible on purpose. ``name`` is the set's, for errors.
     """
+    others = ", ".join(other for other in ENCODINGS if other not in (encoding, "auto"))
     measured = np.concatenate([depth[depth > 0] for depth in depths] or [np.zeros(0, np.float32)])
     if measured.size == 0:
         raise DataError(
             f"data.encoding={encoding}: no pixel of '{name}' is measured in {len(depths)} depth maps. "
-            f"Check data.root, or pass another data.encoding ({_others(encoding)})."
+            f"Check data.root, or pass another data.encoding ({others})."
         )
-    found = DepthRange(
-        min_m=float(measured.min()),
-        median_m=float(np.median(measured)),
-        max_m=float(measured.max()),
-        valid_fraction=measured.size / sum(depth.size for depth in depths),
-    )
+    share = measured.size / sum(depth.size for depth in depths)
+    found = DepthRange(float(measured.min()), float(np.median(measured)), float(measured.max()), share)
     low, high = INDOOR_MEDIAN_M
     if indoor and encoding != "paper_literal" and not low <= found.median_m <= high:
         raise DataError(
             f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, "
             f"indoor sets lie in {low:g} to {high:g} m. "
-            f"Pass another data.encoding ({_others(encoding)}), or data.source.indoor=false for outdoor pairs."
+            f"Pass another data.encoding ({others}), or data.source.indoor=false for outdoor pairs."
         )
     return found
 
@@ -161,13 +139,8 @@ def _check_values(raw: NDArray[np.generic], name: str, where: str) -> None:
             f"{_prefix(where)}8-bit data declared as millimetres "
             f"(largest value {largest} = {largest / 1000:g} m). {_ADVICE_8BIT}"
         )
-    fits = {
-        "uint16_mm": integer,
-        "uint8_10m": raw.dtype == np.uint8,
-        "float_m": raw.dtype.kind == "f",
-        "paper_literal": integer,
-    }
-    if not fits.get(name, True):
+    fits = {"uint8_10m": raw.dtype == np.uint8, "float_m": not integer, "linear": True}
+    if not fits.get(name, integer):
         likely = "float_m" if not integer else "uint8_10m" if raw.dtype == np.uint8 else "uint16_mm"
         raise DataError(f"{_prefix(where)}{raw.dtype} data declared as {name}. Use data.encoding={likely}.")
 
@@ -184,10 +157,6 @@ def _check_scale(scale_m: float | None, offset: float, where: str) -> float:
             "The scale must be positive and both must be finite."
         )
     return scale_m
-
-
-def _others(encoding: str) -> str:
-    return ", ".join(other for other in ENCODINGS if other not in (encoding, "auto"))
 
 
 def _prefix(where: str) -> str:

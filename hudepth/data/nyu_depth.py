@@ -38,7 +38,8 @@ class NYUDepth(Dataset[dict[str, Any]]):
     id, scene   str                          for example ``00012`` and ``kitchen_0004``
     =========== ============================ ==========================================================
 
-    Pairs are decoded when they are asked for, and nothing is written to disk.
+    Pairs are decoded when they are asked for, and nothing is written to disk. Raises ConfigError if an option is out of
+    range, DataError if the root is missing or neither form of the data set.
 
     Args:
         root: the folder with ``index.csv`` and the frames, or ``nyu_depth_v2_labeled.mat`` or its folder.
@@ -47,25 +48,18 @@ class NYUDepth(Dataset[dict[str, Any]]):
             areas, depths take the nearest pixel.
         max_depth_m: depths beyond it are not valid [m].
         seed: of the choice of validation scenes.
-
-    Raises:
-        ConfigError: if an option is out of range.
-        DataError: if the root is missing or is neither form of the data set.
     """
 
     def __init__(
-        self,
-        root: str | Path,
-        split: str = "train",
-        *,
-        size: int | Sequence[int] | None = None,
-        max_depth_m: float = 10.0,
-        seed: int = 42,
-    ) -> None:
+        self, root: str | Path, split: str = "train", *, size: int | Sequence[int] | None = None,
+        max_depth_m: float = 10.0, seed: int = 42,
+    ) -> None:  # fmt: skip
         subset = convert("split", split, Annotated[str, Choice(SUBSETS)])
         self.size: tuple[int, int] | None = convert("size", size, Size | None)
         self.max_depth_m: float = convert("max_depth_m", max_depth_m, Annotated[float, Range(0, above=True)])
-        self.source = _open(Path(root).expanduser())
+        path = Path(root).expanduser()
+        is_mat = path.suffix == ".mat" or (path / "nyu_depth_v2_labeled.mat").exists()
+        self.source: Source = NyuMatSource(path) if is_mat else NyuLabeledSource(path, encoding="linear")
         records = self.source.records()
         if subset == "test":
             self.records = [record for record in records if record.split == "test"]
@@ -76,11 +70,7 @@ class NYUDepth(Dataset[dict[str, Any]]):
         return len(self.records)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Decode one sample.
-
-        Raises:
-            DataError: if its files are missing or damaged.
-        """
+        """Decode one sample; DataError if its files are missing or damaged."""
         record = self.records[index]
         raw = self.source.read(record)
         image, depth = raw.image, read_metres(self.source, record, raw.depth)
@@ -91,17 +81,13 @@ class NYUDepth(Dataset[dict[str, Any]]):
         return {
             "image": torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1).contiguous(),
             "depth": torch.from_numpy(np.where(valid, depth, np.float32(0)))[None],
-            "valid": torch.from_numpy(valid)[None],
-            "id": record.id,
-            "scene": record.scene,
-        }
+            "valid": torch.from_numpy(valid)[None], "id": record.id, "scene": record.scene,
+        }  # fmt: skip
 
     def plot(self, sample: dict[str, Any], *, title: str | None = None) -> Figure:
         """Draw a sample: the image, its depth, and ``sample["prediction"]`` [1, h, w] in metres if there is one.
 
-        Args:
-            sample: as :meth:`__getitem__` returns it.
-            title: of the figure; the scene by default.
+        The title is the scene by default.
         """
         from matplotlib.figure import Figure
 
@@ -117,8 +103,3 @@ class NYUDepth(Dataset[dict[str, Any]]):
             axis.axis("off")
         figure.suptitle(sample["scene"] if title is None else title)
         return figure
-
-
-def _open(root: Path) -> Source:
-    is_file = root.suffix == ".mat" or (root / "nyu_depth_v2_labeled.mat").exists()
-    return NyuMatSource(root) if is_file else NyuLabeledSource(root, encoding="linear")

@@ -33,39 +33,26 @@ POOL_FROM = 32
 
 @dataclass(frozen=True, slots=True)
 class PreparedPair:
-    """One pair, ready for the store."""
+    """One pair, ready for the store; ``range_m`` is its smallest, median and largest measured depth."""
 
     image: NDArray[np.uint8]
     depth_mm: NDArray[np.uint16]
     native_png: NDArray[np.uint8] | None
     native_size: tuple[int, int]
     range_m: tuple[float, float, float]
-    """Smallest, median and largest measured depth."""
     valid_fraction: float
 
 
 def read_metres(source: Source, record: Record, raw: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Turn a pair's stored depth into metres, 0 where unmeasured.
-
-    Raises:
-        DataError: if the encoding does not fit what is stored.
-    """
+    """Turn a pair's stored depth into metres, 0 where unmeasured; DataError if the encoding does not fit it."""
     return to_metres(
-        raw,
-        source.encoding,
-        scale_m=record.depth_scale_m,
-        offset=record.depth_offset,
-        auto_uint8=source.auto_uint8,
-        where=record.depth or record.id,
-    )
+        raw, source.encoding, scale_m=record.depth_scale_m, offset=record.depth_offset,
+        auto_uint8=source.auto_uint8, where=record.depth or record.id,
+    )  # fmt: skip
 
 
 def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair:
-    """Decode, check and resize one pair.
-
-    Raises:
-        DataError: if it cannot be read or holds no measured depth.
-    """
+    """Decode, check and resize one pair; DataError if it cannot be read or holds no measured depth."""
     raw = source.read(record)
     depth_m = read_metres(source, record, raw.depth)
     measured = depth_m[depth_m > 0]
@@ -92,10 +79,9 @@ def prepare_pairs(
     workers = workers or usable_cores()
     if workers == 1 or len(records) < POOL_FROM:
         for record in records:
-            yield record, _outcome(source, record, size, native=native)
+            yield record, _work(record, source=source, size=size, native=native)
         return
-    # spawn: a fork would copy locks of the parent's threads
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("spawn")  # a fork would copy locks of the parent's threads
     with ProcessPoolExecutor(workers, context, _start_worker, (source, size, native)) as pool:
         waiting: deque[tuple[Record, Future[PreparedPair | str]]] = deque()
         try:
@@ -104,8 +90,7 @@ def prepare_pairs(
                 if len(waiting) > 8 * workers:  # bounds the memory that finished pairs take
                     first, future = waiting.popleft()
                     yield first, future.result()
-            while waiting:
-                first, future = waiting.popleft()
+            for first, future in waiting:
                 yield first, future.result()
         except BrokenProcessPool as error:
             raise DataError(
@@ -114,13 +99,6 @@ def prepare_pairs(
         finally:
             for _, future in waiting:
                 future.cancel()
-
-
-def _outcome(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair | str:
-    try:
-        return prepare_pair(source, record, size, native=native)
-    except DataError as error:
-        return str(error)
 
 
 _worker: dict[str, Any] = {}
@@ -141,5 +119,8 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _work(record: Record) -> PreparedPair | str:
-    return _outcome(_worker["source"], record, _worker["size"], native=_worker["native"])
+def _work(record: Record, **options: Any) -> PreparedPair | str:
+    try:
+        return prepare_pair(record=record, **(options or _worker))
+    except DataError as error:
+        return str(error)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import errno
 import hashlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,31 +30,47 @@ UNIT_SAMPLES = 16
 """Number of pairs whose depth is checked for a plausible unit beforehand."""
 
 OnError = Literal["raise", "skip"]
+_NONE = np.empty(0, np.uint8)
 
 
 def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Path) -> Path:
     """Return the path of the store of this source and size: equal inputs give equal names, changed files new ones.
 
-    Raises:
-        DataError: if the source's root or index cannot be read.
+    Raises DataError if the source's root or index cannot be read.
     """
     times = [file.stat().st_mtime_ns for file in source.files() if file.exists()]
     key = [VERSION, source.name, source.fingerprint(), times, size, source.encoding, native]
     return cache / f"{source.name}-{size[0]}x{size[1]}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
 
 
+def build_once(path: Path, build: Callable[[Path], None]) -> None:
+    """Build a file of the cache if it does not exist: one of several jobs builds it, the others wait.
+
+    Raises DataError if it cannot be written.
+    """
+    try:
+        if not path.exists():  # try without the lock first, for caches that are read-only
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(path.with_suffix(".lock")):
+                if not path.exists():
+                    for leftover in path.parent.glob(f".{path.name}.*.part"):  # of a run that was killed
+                        leftover.unlink(missing_ok=True)
+                    build(path)
+    except OSError as error:
+        raise DataError(
+            f"paths.cache: cannot write '{path}' ({error.strerror or error}). "
+            "Free some space, or pass paths.cache=<a folder you can write to>."
+        ) from error
+
+
 def prepare(
-    source: Source,
-    *,
-    size: tuple[int, int],
-    cache: str | Path,
-    native: bool = True,
-    on_error: str = "raise",
+    source: Source, *, size: tuple[int, int], cache: str | Path, native: bool = True, on_error: str = "raise",
     workers: int | None = None,
-) -> DepthStore:
+) -> DepthStore:  # fmt: skip
     """Return the depth store of ``source``, and prepare it first if it does not exist.
 
-    Safe to call from several jobs at once: one prepares, the others wait. A call that is killed leaves no store.
+    Safe to call from several jobs at once. A call that is killed leaves no store. Raises ConfigError for an unknown
+    ``on_error``; DataError for bad pairs, implausible units, or a folder that cannot be written.
 
     Args:
         source: the data set.
@@ -63,38 +80,17 @@ def prepare(
         native: also keep the ground truth at its native resolution, for protocols like ``eigen``.
         on_error: ``raise`` at the first bad pair, or ``skip`` bad pairs and list them.
         workers: processes; one per core by default.
-
-    Raises:
-        ConfigError: for an unknown ``on_error``.
-        DataError: for bad pairs, implausible units, or a folder that cannot be written.
     """
     convert("data.on_error", on_error, OnError)
     path = store_path(source, size=size, native=native, cache=Path(cache).expanduser())
-    try:
-        if not path.exists():  # try without the lock first, for caches that are read-only
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with FileLock(path.with_suffix(".lock")):
-                if not path.exists():
-                    _remove_leftovers(path)
-                    _build(source, path, size=size, native=native, on_error=on_error, workers=workers)
-    except OSError as error:
-        raise DataError(
-            f"paths.cache: cannot write '{path}' ({error.strerror or error}). "
-            "Free some space, or pass paths.cache=<a folder you can write to>."
-        ) from error
+    build_once(path, partial(_build, source, size=size, native=native, on_error=on_error, workers=workers))
     store = DepthStore(path)
-    if store.info["skipped"] and on_error == "raise":
+    if (skipped := store.info["skipped"]) and on_error == "raise":
         raise DataError(
-            f"{source.name}: {len(store.info['skipped'])} pairs could not be read, the first: "
-            f"{store.info['skipped'][0]} Fix them, or pass data.on_error=skip to leave them out."
+            f"{source.name}: {len(skipped)} pairs could not be read, the first: "
+            f"{skipped[0]} Fix them, or pass data.on_error=skip to leave them out."
         )
     return store
-
-
-def _remove_leftovers(path: Path) -> None:
-    """Remove what a killed run left; only called while holding the lock."""
-    for leftover in path.parent.glob(f".{path.name}.*.part"):
-        leftover.unlink(missing_ok=True)
 
 
 def _build(
@@ -102,7 +98,9 @@ def _build(
 ) -> None:
     records = source.records()
     _check_units(source, records)
-    _check_space(path.parent, len(records), size)
+    needed, free = 5 * len(records) * size[0] * size[1], shutil.disk_usage(path.parent).free
+    if needed > free:  # for images and depths
+        raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
     skipped: list[str] = []
     pairs: list[PreparedPair] = []  # without their pixels
     with written_whole(path) as part:
@@ -117,7 +115,7 @@ def _build(
                         skipped.append(outcome)
                         continue
                     writer.append(record, outcome.image, outcome.depth_mm, outcome.native_png)
-                    pairs.append(_figures(outcome))
+                    pairs.append(replace(outcome, image=_NONE, depth_mm=_NONE.astype(np.uint16), native_png=None))
             if not pairs:
                 raise DataError(f"{source.name}: none of {len(records)} pairs could be read; the first: {skipped[0]}")
             info = _info(source, pairs, skipped)
@@ -135,29 +133,17 @@ def _check_units(source: Source, records: Sequence[Record]) -> None:
     step = max(1, len(records) // UNIT_SAMPLES)
     depths, refused = [], []
     for record in records[::step][:UNIT_SAMPLES]:
+        raw = None
         try:
             raw = source.read(record).depth
-        except DataError:
-            continue  # reported later, in its turn
-        try:
             depths.append(read_metres(source, record, raw))
         except DataError as error:
-            refused.append(error)
+            if raw is not None:  # files that cannot be read are reported later, in their turn
+                refused.append(error)
     if refused and not depths:  # the wrong encoding, not one bad file
         raise refused[0]
     if any((depth > 0).any() for depth in depths):
         check_range(depths, indoor=source.indoor, encoding=source.encoding, name=source.name)
-
-
-def _check_space(folder: Path, pairs: int, size: tuple[int, int]) -> None:
-    """Refuse a disk without room for the images and depths before filling it."""
-    needed, free = 5 * pairs * size[0] * size[1], shutil.disk_usage(folder).free
-    if needed > free:
-        raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
-
-
-def _figures(pair: PreparedPair) -> PreparedPair:
-    return replace(pair, image=np.empty(0, np.uint8), depth_mm=np.empty(0, np.uint16), native_png=None)
 
 
 def _info(source: Source, pairs: Sequence[PreparedPair], skipped: list[str]) -> dict[str, Any]:

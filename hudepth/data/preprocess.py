@@ -13,16 +13,12 @@ from hudepth.data.warp import resize
 
 
 def preprocess(
-    batch: RawBatch,
-    *,
-    max_depth_m: float,
-    size: tuple[int, int] | None = None,
+    batch: RawBatch, *, max_depth_m: float, size: tuple[int, int] | None = None,
     augment: Callable[..., tuple[Tensor, Tensor]] | None = None,
-) -> Batch:
+) -> Batch:  # fmt: skip
     """Normalise a batch: ImageNet statistics for the image; depth divided, clipped, masked.
 
     Args:
-        batch: RGB bytes and millimetres.
         max_depth_m: maximum depth [m]; depth is clipped to it and divided by it.
         size: (height, width) of the result; unchanged by default.
         augment: changes the image in [0, 1] and the unit depth, and resizes them to ``size``.
@@ -31,20 +27,15 @@ def preprocess(
     unit_depth = batch["depth_mm"].to(torch.float32)[:, None] / (1000 * max_depth_m)
     had_truth = unit_depth > 0
     if "teacher_m" in batch:
-        unit_depth = torch.cat(
-            [unit_depth, batch["teacher_m"][:, None] / max_depth_m], dim=1
-        )  # moved like the ground truth
+        teacher = batch["teacher_m"][:, None] / max_depth_m
+        unit_depth = torch.cat([unit_depth, teacher], dim=1)  # moved like the ground truth
     size = size or (image.shape[-2], image.shape[-1])
     image, depths = (augment or resize)(image, unit_depth, size=size)
     unit_depth = depths[:, :1]
-    result = Batch(
-        image=normalise_image(image),
-        unit_depth=unit_depth.clamp(max=1),
-        valid=unit_depth > 0,
-        index=batch["index"],
-    )
+    valid = unit_depth > 0
+    result = Batch(image=normalise_image(image), unit_depth=unit_depth.clamp(max=1), valid=valid, index=batch["index"])
     if augment is not None:
-        result["emptied"] = had_truth.any() & ~result["valid"].any()
+        result["emptied"] = had_truth.any() & ~valid.any()
     if "teacher_m" in batch:
         result["teacher"] = depths[:, 1:]
     if "native_depth" in batch:

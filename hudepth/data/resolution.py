@@ -15,23 +15,15 @@ class Stage:
     """A part of a training."""
 
     size: Size
-    """(height, width) of training images."""
     until: Annotated[float, Range(0, 1, above=True, below=True)]
     """Share of the epochs after which it ends."""
 
 
 def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, int]) -> list[Stage]:
-    """Read ``data.progressive``.
+    """Read ``data.progressive``: mappings of ``size`` and ``until``, in order.
 
-    Args:
-        progressive: mappings of ``size`` and ``until``, in order.
-        size: (height, width) of the images in the store, which follows the last stage.
-
-    Returns:
-        The stages whose images are smaller than the store's; others are skipped, so one plan serves several sizes.
-
-    Raises:
-        ConfigError: if an entry is malformed, or the shares do not rise.
+    Returns the stages whose images are smaller than the store's ``size``; others are skipped, so one plan serves more
+    sizes. Raises ConfigError if an entry is malformed, or the shares do not rise.
     """
     stages: list[Stage] = convert("data.progressive", list(progressive), list[Stage])
     for number, (before, stage) in enumerate(zip([0.0, *(stage.until for stage in stages)], stages, strict=False)):
@@ -44,13 +36,9 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
 
 
 def size_at(stages: Sequence[Stage], epoch: int, *, epochs: int | None, final: tuple[int, int]) -> tuple[int, int]:
-    """Return the (height, width) of training images in an epoch.
+    """Return the (height, width) of training images in an epoch, counted from 0.
 
-    Args:
-        stages: of the training.
-        epoch: from 0.
-        epochs: of the training; if unlimited (None or -1), only ``final`` is used.
-        final: size after the last stage and in the last epoch.
+    ``final`` is the size after the last stage, in the last epoch, and of unlimited training (``epochs`` None or -1).
     """
     if epochs is None or epochs < 1 or epoch >= epochs - 1:
         return final

@@ -36,20 +36,13 @@ class Split:
 
     def summary(self) -> dict[str, Any]:
         """Return kind, seed, fractions, counts and hash, for metric files."""
-        return {
-            "kind": self.kind,
-            "seed": self.seed,
-            "fractions": list(self.fractions),
-            "counts": {subset: len(self[subset]) for subset in SUBSETS},
-            "sha256": self.sha256,
-        }
+        counts = {subset: len(self[subset]) for subset in SUBSETS}
+        known = {"kind": self.kind, "seed": self.seed, "fractions": list(self.fractions)}
+        return {**known, "counts": counts, "sha256": self.sha256}
 
 
 def split_counts(n: int, fractions: Sequence[float]) -> tuple[int, int, int]:
-    """Return the sizes of the subsets as the paper cuts them: int(f0 n), int(f1 n), the rest.
-
-    50,688 pairs at 0.7 / 0.1 / 0.2 give 35,481 / 5,068 / 10,139.
-    """
+    """Return the sizes of the subsets as the paper cuts them: int(f0 n), int(f1 n), the rest."""
     train, val = int(fractions[0] * n), int(fractions[1] * n)
     return train, val, n - train - val
 
@@ -66,9 +59,7 @@ def make_split(
         seed: of the permutation of frames or scenes.
         fractions: of train, val and test; they sum to 1. ``official`` uses only the ratio of the first two.
 
-    Raises:
-        ConfigError: for an unknown kind or fractions that do not sum to 1.
-        DataError: if the records lack what the kind needs, or a subset is left empty.
+    Raises ConfigError as :func:`check_split`; DataError if the records lack what the kind needs, or a subset is empty.
     """
     check_split(kind, fractions)
     subsets = dict(zip(SUBSETS, _KINDS[kind](records, seed, fractions), strict=True))
@@ -79,21 +70,13 @@ def make_split(
                 f"{len({r.scene for r in records})} scenes, fractions {list(fractions)}). "
                 "Pass other data.fractions, another data.split, or more data."
             )
-    return Split(
-        kind=kind,
-        seed=seed,
-        fractions=(fractions[0], fractions[1], fractions[2]),
-        **subsets,
-        sha256=_hash({name: [records[i].id for i in indices] for name, indices in subsets.items()}),
-    )
+    train, val, test = fractions
+    sha256 = _hash({name: [records[i].id for i in indices] for name, indices in subsets.items()})
+    return Split(kind=kind, seed=seed, fractions=(train, val, test), **subsets, sha256=sha256)
 
 
 def check_split(kind: str, fractions: Sequence[float]) -> None:
-    """Check the arguments of :func:`make_split`.
-
-    Raises:
-        ConfigError: for an unknown kind or fractions that do not sum to 1.
-    """
+    """Check the arguments of :func:`make_split`: ConfigError for an unknown kind or fractions that do not sum to 1."""
     if kind not in _KINDS:
         raise ConfigError(f"data.split: no '{kind}'.{did_you_mean(kind, _KINDS)} Pass one of {', '.join(_KINDS)}.")
     # "not <=" rather than ">": a NaN is refused too
@@ -102,7 +85,7 @@ def check_split(kind: str, fractions: Sequence[float]) -> None:
 
 
 def _permutation(n: int, seed: int) -> list[int]:
-    # What torch.utils.data.random_split draws for the same seed.
+    """Return what torch.utils.data.random_split draws for the same seed."""
     return list(torch.randperm(n, generator=torch.Generator().manual_seed(seed)).tolist())
 
 
@@ -132,13 +115,8 @@ def _by_scene(
     return tuple(sorted(subset) for subset in dealt)
 
 
-def _scene(records: Sequence[Record], seed: int, fractions: Sequence[float]) -> tuple[list[int], ...]:
-    return _by_scene(records, range(len(records)), seed, fractions)
-
-
 def _official(records: Sequence[Record], seed: int, fractions: Sequence[float]) -> tuple[list[int], ...]:
-    unknown = sum(record.split not in ("train", "test") for record in records)
-    if unknown:
+    if unknown := sum(record.split not in ("train", "test") for record in records):
         raise DataError(
             f"data.split=official: {unknown} of {len(records)} pairs are in neither 'train' nor 'test' of the set's "
             "own split. Pass data.split=scene or data.split=random."
@@ -154,7 +132,7 @@ def _official(records: Sequence[Record], seed: int, fractions: Sequence[float]) 
 
 _KINDS: Mapping[str, Callable[[Sequence[Record], int, Sequence[float]], tuple[list[int], ...]]] = {
     "random": _random,
-    "scene": _scene,
+    "scene": lambda records, seed, fractions: _by_scene(records, range(len(records)), seed, fractions),
     "official": _official,
 }
 
@@ -171,8 +149,7 @@ def save_split(path: Path, split: Split, records: Sequence[Record]) -> None:
 def load_split(path: Path, records: Sequence[Record]) -> Split:
     """Read split.json and find its ids among ``records``.
 
-    Raises:
-        DataError: if the file is damaged, its hash does not fit its ids, or a pair it names is not there.
+    Raises DataError if the file is damaged, its hash does not fit its ids, or a pair it names is not there.
     """
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
@@ -184,8 +161,7 @@ def load_split(path: Path, records: Sequence[Record]) -> Split:
     if _hash(ids) != sha256:
         raise DataError(f"'{path}': its ids do not have the hash it states; it was edited. Restore it, or train again.")
     position = {record.id: i for i, record in enumerate(records)}
-    lost = [i for name in SUBSETS for i in ids[name] if i not in position]
-    if lost:
+    if lost := [i for name in SUBSETS for i in ids[name] if i not in position]:
         raise DataError(
             f"'{path}' names {len(lost)} pairs that this data set does not have, the first is '{lost[0]}'. "
             "Pass the data= and data.root= it was trained on."

@@ -40,15 +40,13 @@ VERSION = 1
 MM_PER_M = 1000.0
 MAX_STORED_M = np.iinfo(np.uint16).max / MM_PER_M
 """65.535 m; larger depths are stored as this."""
+_TEXTS = ("id", "scene", "split", "category")
 
 
 def to_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Round metres to the millimetres a store holds; 0 (unmeasured) stays 0.
+    """Round depths [h, w], finite and not negative [m], to the millimetres a store holds.
 
-    A measured depth never becomes 0: below half a millimetre it is stored as one.
-
-    Args:
-        depth_m: [h, w], finite and not negative [m].
+    0 (unmeasured) stays 0, and a measured depth never becomes 0: below half a millimetre it is stored as one.
     """
     mm = np.rint(np.minimum(depth_m, MAX_STORED_M) * MM_PER_M)
     return np.maximum(mm, depth_m > 0).astype(np.uint16)
@@ -66,26 +64,18 @@ def _plain_os_errors() -> Iterator[None]:
 
 
 class StoreWriter:
-    """Writes a depth store pair by pair. Use it inside :func:`hudepth.base.files.written_whole`.
+    """Writes a depth store pair by pair, over ``path``. Use it inside :func:`hudepth.base.files.written_whole`.
 
-    Args:
-        path: the file, overwritten.
-        size: (height, width) of images and depths.
-        native: whether each pair has ground truth at native resolution.
-
-    Raises:
-        OSError: from here and from every method, if the file cannot be written.
+    ``size`` is (height, width) of images and depths; ``native``: whether each pair has ground truth at native
+    resolution. All methods raise OSError if the file cannot be written.
     """
 
     def __init__(self, path: Path, *, size: tuple[int, int], native: bool) -> None:
         with _plain_os_errors():
             self._file = h5py.File(path, "w", libver="latest")
-        height, width = size
-        self._image = self._file.create_dataset(
-            "image", (0, height, width, 3), "u1", maxshape=(None, height, width, 3), chunks=(1, height, width, 3)
-        )
-        self._depth = self._file.create_dataset(
-            "depth_mm", (0, height, width), "u2", maxshape=(None, height, width), chunks=(1, height, width)
+        self._image, self._depth = (
+            self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
+            for name, dtype, shape in (("image", "u1", (*size, 3)), ("depth_mm", "u2", size))
         )
         self._native = native
         if native:
@@ -94,16 +84,12 @@ class StoreWriter:
         self._records: list[Record] = []
 
     def append(
-        self,
-        record: Record,
-        image: NDArray[np.uint8],
-        depth_mm: NDArray[np.uint16],
+        self, record: Record, image: NDArray[np.uint8], depth_mm: NDArray[np.uint16],
         native_png: NDArray[np.uint8] | None,
-    ) -> None:
-        """Add one pair at training size, with its native ground truth as an encoded 16-bit PNG if the store has them.
+    ) -> None:  # fmt: skip
+        """Add one pair at training size, with its native ground truth as an encoded 16-bit PNG.
 
-        Raises:
-            ValueError: if the pair has native ground truth and the store has none, or vice versa.
+        Raises ValueError if the pair has native ground truth and the store has none, or vice versa.
         """
         if self._native != (native_png is not None):
             raise ValueError(f"'{record.id}': either all pairs of a store have native ground truth or none.")
@@ -128,7 +114,7 @@ class StoreWriter:
                 dataset.resize(len(self._records), axis=0)
             if self._native:
                 self._file["native/end"] = np.array(self._ends, dtype=np.int64)
-            for field in ("id", "scene", "split", "category"):
+            for field in _TEXTS:
                 values = [getattr(record, field).encode() for record in self._records]
                 self._file[f"records/{field}"] = np.array(values, dtype=h5py.string_dtype())
             self._file["records/frame"] = np.array([record.frame for record in self._records], dtype=np.int64)
@@ -151,15 +137,9 @@ class StoreWriter:
 
 
 class DepthStore:
-    """A depth store, opened for reading.
+    """A depth store, opened for reading. Worker processes can be given it: each opens its own handle on first use.
 
-    It can be handed to worker processes: each opens its own HDF5 handle on first use.
-
-    Args:
-        path: the file.
-
-    Raises:
-        DataError: if it is missing, unfinished or of another version.
+    Raises DataError if the file is missing, unfinished or of another version.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -173,14 +153,12 @@ class DepthStore:
                     )
                 self.info: dict[str, Any] = json.loads(file.attrs["info"])
                 self.size: tuple[int, int] = tuple(file["image"].shape[1:3])
-                columns = {field: file[f"records/{field}"].asstr()[:] for field in ("id", "scene", "split", "category")}
-                frames = file["records/frame"][:]
+                columns = [file[f"records/{field}"].asstr()[:] for field in _TEXTS]
+                frames = file["records/frame"][:].tolist()
                 self.has_native = "native" in file
             self.records = [
-                Record(id=i, scene=s, frame=int(f), split=p, category=c)
-                for i, s, f, p, c in zip(
-                    columns["id"], columns["scene"], frames, columns["split"], columns["category"], strict=True
-                )
+                Record(frame=frame, **dict(zip(_TEXTS, texts, strict=True)))
+                for frame, *texts in zip(frames, *columns, strict=True)
             ]
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             raise DataError(
@@ -191,30 +169,20 @@ class DepthStore:
         return len(self.records)
 
     def read(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """Read pairs at training size.
+        """Read pairs at training size by their positions, in any order, possibly repeated.
 
-        Args:
-            indices: positions in the store, in any order, possibly repeated.
-
-        Returns:
-            image [n, h, w, 3] RGB, and depth [n, h, w] in millimetres, 0 where unmeasured.
+        Returns image [n, h, w, 3] RGB, and depth [n, h, w] in millimetres, 0 where unmeasured.
         """
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
         file = self._handle.get(self.path)
-        source_image, source_depth = file["image"], file["depth_mm"]
-        for row, index in enumerate(indices):
-            source_image.read_direct(images, np.s_[index], np.s_[row])
-            source_depth.read_direct(depths, np.s_[index], np.s_[row])
+        for source, target in ((file["image"], images), (file["depth_mm"], depths)):
+            for row, index in enumerate(indices):
+                source.read_direct(target, np.s_[index], np.s_[row])
         return images, depths
 
     def read_ahead(self, first: int, last: int) -> None:
-        """Ask the system to read neighbouring pairs from the disk in one go, if it takes such hints.
-
-        Args:
-            first: position of the first pair.
-            last: position of the last one.
-        """
+        """Ask the system to read the pairs from ``first`` to ``last`` in one go, if it takes such hints."""
         if not hasattr(os, "posix_fadvise"):
             return
         file = self._handle.get(self.path)
@@ -223,15 +191,13 @@ class DepthStore:
                 data = file[name]
                 start, row = data.id.get_offset(), data.dtype.itemsize * math.prod(data.shape[1:])
                 if start is not None:  # else not in one piece
-                    os.posix_fadvise(
-                        raw.fileno(), start + first * row, (last - first + 1) * row, os.POSIX_FADV_WILLNEED
-                    )
+                    length = (last - first + 1) * row
+                    os.posix_fadvise(raw.fileno(), start + first * row, length, os.POSIX_FADV_WILLNEED)
 
     def read_native(self, index: int) -> NDArray[np.float32]:
         """Read one ground truth at its native resolution: [H, W] metres, 0 where unmeasured.
 
-        Raises:
-            DataError: if the store was prepared without native ground truth.
+        Raises DataError if the store was prepared without native ground truth.
         """
         if not self.has_native:
             raise DataError(
@@ -243,6 +209,6 @@ class DepthStore:
         start = int(ends[index - 1]) if index else 0
         mm = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
         if mm is None:
-            what = f"the ground truth of '{self.records[index].id}' is damaged"
-            raise DataError(f"'{self.path}': {what}. Delete it and prepare again.")
+            name = self.records[index].id
+            raise DataError(f"'{self.path}': the ground truth of '{name}' is damaged. Delete it and prepare again.")
         return mm.astype(np.float32) / np.float32(MM_PER_M)

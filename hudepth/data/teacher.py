@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 import tokenize
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
 import h5py
 import numpy as np
-from filelock import FileLock
 from numpy.typing import NDArray
 
 from hudepth.base.console import track
 from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
-from hudepth.data.prepare import MAX_SIZES
+from hudepth.data.prepare import MAX_SIZES, build_once
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.decoding import read_depth
 from hudepth.data.sources.files import PerProcess
@@ -30,15 +30,13 @@ class TeacherDepths:
     """A teacher's depths at the training size, prepared once from a folder of files.
 
     A ``.npy`` holds floats: metres, or any unit if the loss is affine-invariant; a ``.png`` 16-bit millimetres.
-    Values that are not finite or not positive count as missing.
+    Values that are not finite or not positive count as missing. Raises DataError if depths are missing, cannot be
+    read, or are not of their images' size.
 
     Args:
         folder: with a file for each training pair: its id, then one of :data:`ENDINGS`.
         store: of the pairs.
         indices: the training pairs, as positions in the store.
-
-    Raises:
-        DataError: if depths are missing, cannot be read, or are not of their images' size.
     """
 
     def __init__(self, folder: str | Path, store: DepthStore, indices: Sequence[int]) -> None:
@@ -50,26 +48,14 @@ class TeacherDepths:
         files = _find(root, records)
         self._position = {index: position for position, index in enumerate(rows)}
         self.size = store.size
-        key = [
-            store.path.name,
-            str(root.resolve()),
-            [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files],
-            rows,
-        ]
-        name = f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
-        self.path = store.path.with_name(name)
-        if not self.path.exists():  # try without the lock first, for caches that are read-only
-            with FileLock(self.path.with_suffix(".lock")):
-                if not self.path.exists():
-                    _prepare(files, records, store, self.path)
+        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+        key = [store.path.name, str(root.resolve()), stats, rows]
+        self.path = store.path.with_name(f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5")
+        build_once(self.path, partial(_prepare, files, store))
         self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)
 
     def read(self, indices: Sequence[int]) -> NDArray[np.float32]:
-        """Read depths [n, h, w], 0 where there is none.
-
-        Args:
-            indices: positions in the depth store.
-        """
+        """Read the depths at positions in the depth store: [n, h, w], 0 where there is none."""
         depths = np.empty((len(indices), *self.size), np.float32)
         source = self._handle.get(self.path)["depth"]
         for row, index in enumerate(indices):
@@ -79,42 +65,31 @@ class TeacherDepths:
 
 def _find(root: Path, records: Sequence[Record]) -> list[Path]:
     """Return the file of each record."""
-    files, missing = [], []
-    for record in records:
-        found = next((path for ending in ENDINGS if (path := root / f"{record.id}{ending}").is_file()), None)
-        if found is None:
-            missing.append(record.id)
-        else:
-            files.append(found)
-    if missing:
+    candidates = ([root / f"{record.id}{ending}" for ending in ENDINGS] for record in records)
+    files = [next(filter(Path.is_file, paths), None) for paths in candidates]
+    if missing := [record.id for record, file in zip(records, files, strict=True) if file is None]:
         raise DataError(
             f"distill.teacher: {len(missing)} of {len(records)} training pairs have no depth in '{root}', the first is "
             f"'{missing[0]}': no {missing[0]}.npy or .png. Predict them with hudepth-predict, or copy them there."
         )
-    return files
+    return [file for file in files if file]
 
 
-def _prepare(files: Sequence[Path], records: Sequence[Record], store: DepthStore, path: Path) -> None:
+def _prepare(files: Sequence[Path], store: DepthStore, path: Path) -> None:
     native = {tuple(size) for size in store.info.get("native_sizes") or []} | {tuple(store.size)}
     height, width = store.size
-    try:
-        with written_whole(path) as part, h5py.File(part, "w", libver="latest") as out:
-            depths = out.create_dataset("depth", (len(files), height, width), "f4", chunks=(1, height, width))
-            for row, file in enumerate(track(files, total=len(files), what="reading the teacher's depths")):
-                depth = _read(file)
-                if depth.shape not in native and len(native) < MAX_SIZES:  # else the store names some of them only
-                    sizes = " or ".join(f"{h} x {w}" for h, w in sorted(native, reverse=True)[:3])
-                    raise DataError(
-                        f"distill.teacher: '{file}' is {depth.shape[0]} x {depth.shape[1]}, but the images are {sizes} "
-                        "(height x width). Resize it to its image."
-                    )
-                depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-                depths[row] = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    except OSError as error:
-        raise DataError(
-            f"paths.cache: cannot write '{path}' ({error.strerror or error}). "
-            "Free some space, or pass paths.cache=<a folder you can write to>."
-        ) from error
+    with written_whole(path) as part, h5py.File(part, "w", libver="latest") as out:
+        depths = out.create_dataset("depth", (len(files), height, width), "f4", chunks=(1, height, width))
+        for row, file in enumerate(track(files, total=len(files), what="reading the teacher's depths")):
+            depth = _read(file)
+            if depth.shape not in native and len(native) < MAX_SIZES:  # else the store names some of them only
+                sizes = " or ".join(f"{h} x {w}" for h, w in sorted(native, reverse=True)[:3])
+                raise DataError(
+                    f"distill.teacher: '{file}' is {depth.shape[0]} x {depth.shape[1]}, but the images are {sizes} "
+                    "(height x width). Resize it to its image."
+                )
+            depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+            depths[row] = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def _read(file: Path) -> NDArray[np.float32]:

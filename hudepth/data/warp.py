@@ -17,39 +17,28 @@ from torch.nn import functional
 
 @dataclass(frozen=True)
 class Geometry:
-    """How each image of a batch is cropped, rolled and flipped; see :func:`warp`."""
+    """How each image of a batch is cropped, rolled and flipped; see :func:`warp`.
+
+    ``zoom`` enlarges the crop, at least 1; ``centre`` is its x and y, where [-1, 1] spans the image; ``angle`` is the
+    roll of the camera [radians], clockwise; ``flip`` swaps left and right.
+    """
 
     zoom: Float[Tensor, " b"]
-    """Enlargement of the crop, at least 1."""
     centre: Float[Tensor, "b 2"]
-    """Of the crop, x and y, where [-1, 1] spans the image."""
     angle: Float[Tensor, " b"]
-    """Roll of the camera [radians], clockwise."""
     flip: Bool[Tensor, " b"]
-    """Whether left and right are swapped."""
 
 
 def warp(
-    image: Float[Tensor, "b 3 h w"],
-    depth: Float[Tensor, "b d h w"],
-    geometry: Geometry,
-    *,
-    size: tuple[int, int],
-    aspect: float,
-) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
-    """Crop, zoom, roll and flip images and depths, and resize them.
+    image: Float[Tensor, "b 3 h w"], depth: Float[Tensor, "b d h w"], geometry: Geometry, *,
+    size: tuple[int, int], aspect: float,
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:  # fmt: skip
+    """Crop, zoom, roll and flip images and depths (0 where unmeasured) in any units, and resize them to ``size``.
 
     Images are interpolated linearly; depth takes the nearest pixel, since the mean of two surfaces is the depth of
     neither. Beyond the image's edge, colours are repeated and depth is unmeasured. Zooming divides depth; rolling and
-    moving the crop do not change depth along the optical axis.
-
-    Args:
-        image: in any unit.
-        depth: one or more maps in any unit, 0 where unmeasured.
-        geometry: of each image.
-        size: (height, width) of the result.
-        aspect: width over height of the scene, so that a roll is a rotation even if images were stretched to another
-            shape.
+    moving the crop do not change depth along the optical axis. ``aspect`` is width over height of the scene, so that a
+    roll is a rotation even if images were stretched to another shape.
     """
     cos, sin = geometry.angle.cos() / geometry.zoom, geometry.angle.sin() / geometry.zoom
     mirror = torch.where(geometry.flip, -1.0, 1.0).to(cos)

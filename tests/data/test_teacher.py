@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
-from hudepth.data import teacher
+from hudepth.data import prepare, teacher
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter
@@ -172,7 +172,7 @@ def test_a_cache_that_can_only_be_read_is_enough(
     def locked(*_: Any) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(teacher, "FileLock", locked)
+    monkeypatch.setattr(prepare, "FileLock", locked)
     np.testing.assert_array_equal(TeacherDepths(folder, store, range(N)).read([4])[0], random_depths()[4])
 
 
@@ -208,7 +208,7 @@ def test_missing_depths(store: DepthStore, folder: Path) -> None:
         TeacherDepths(folder, store, [3, 0, 2])
     assert str(caught.value) == (
         f"distill.teacher: 2 of 3 training pairs have no depth in '{folder}', the first is 'p2': no p2.npy or .png. "
-        "Predict them with hudepth-predict, or lay them there."
+        "Predict them with hudepth-predict, or copy them there."
     )
 
 

@@ -25,7 +25,6 @@ class Record:
     id: str
     """Unique in its source and the same on every machine, for example ``00012`` or ``kitchen_0004/17``."""
     scene: str
-    """Frames of one scene belong together: a scene-disjoint split never separates them."""
     frame: int
     """Position within the scene (video order where there is one)."""
     split: str = ""
@@ -33,36 +32,30 @@ class Record:
     category: str = ""
     """Kind of scene, for example ``kitchen``; empty if unknown."""
     image: str = ""
-    """Location of the image, in the form the source's ``read`` expects (usually a path relative to the root)."""
     depth: str = ""
-    """Location of the depth map, likewise."""
+    """As ``image``: where the source's ``read`` finds it, usually a path relative to the root."""
     depth_scale_m: float | None = None
-    """For the ``linear`` encoding: depth [m] = (value + depth_offset) * depth_scale_m."""
     depth_offset: float = 0.0
-    """For the ``linear`` encoding, in units of the stored value."""
+    """For the ``linear`` encoding: depth [m] = (value + depth_offset) * depth_scale_m."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawPair:
-    """One pair as its files hold it: decoded, but with depth still in the source's own encoding."""
+    """One pair, decoded: image [H, W, 3] RGB, and depth [H, W] of any dtype, still in the source's own encoding."""
 
     image: NDArray[np.uint8]
-    """[H, W, 3] RGB."""
     depth: NDArray[np.generic]
-    """[H, W], any dtype, in the units of the source's encoding."""
 
 
 class Source(ABC):
-    """A data set in some form on disk, or generated: a list of records and a way to read each.
+    """A data set in some form on disk, or generated: a list of records and a way to read each. Stores bear its name.
 
     To add a data set, write one subclass and one configuration file in ``conf/data/``. Sources must be picklable, since
     worker processes get a copy: open file handles lazily (:class:`hudepth.data.sources.files.PerProcess`).
     """
 
     name: ClassVar[str]
-    """Name of the data set, part of the name of its depth stores."""
     homepage: ClassVar[str] = ""
-    """Where the data set is published."""
     licence: ClassVar[str] = "other"
     """Licence identifier of the data for model cards, for example ``mit``."""
     terms: ClassVar[str] = ""
@@ -82,17 +75,12 @@ class Source(ABC):
     def records(self) -> Sequence[Record]:
         """List all pairs in a stable order, without opening an image.
 
-        Raises:
-            DataError: if the root or its index is missing, malformed or empty.
+        Raises DataError if the root or its index is missing, malformed or empty.
         """
 
     @abstractmethod
     def read(self, record: Record) -> RawPair:
-        """Decode one pair.
-
-        Raises:
-            DataError: if a file is missing, truncated, too large, or image and depth differ in size.
-        """
+        """Decode one pair; DataError if a file is missing, truncated, too large, or image and depth differ in size."""
 
     def files(self) -> Sequence[Path]:
         """Return every file this source reads; empty for generated data."""
@@ -108,11 +96,7 @@ class Source(ABC):
 
 
 def existing_root(root: str | Path | None, *, expects: str) -> Path:
-    """Return ``data.root`` as a path; ``expects`` describes in errors what should be there.
-
-    Raises:
-        DataError: if no root was given or it does not exist.
-    """
+    """Return ``data.root`` as a path; DataError, with what it ``expects``, if none was given or it does not exist."""
     if root and (path := Path(root).expanduser()).exists():
         return path
     found = f": '{root}' does not exist" if root else " is not set"

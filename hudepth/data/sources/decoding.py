@@ -21,19 +21,10 @@ _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 
 
 def read_image(source: Path | bytes, *, where: str = "") -> NDArray[np.uint8]:
-    """Decode a JPEG or PNG; grey, RGBA and 16-bit images become 8-bit RGB.
+    """Decode a JPEG or PNG file, or its bytes; grey, RGBA and 16-bit images become 8-bit RGB [H, W, 3].
 
-    An orientation tag is not applied: the depth has none, and the two would no longer match.
-
-    Args:
-        source: a path, or the bytes of a file.
-        where: names the file in errors; the path by default.
-
-    Returns:
-        [H, W, 3] RGB.
-
-    Raises:
-        DataError: if the file is missing, truncated, damaged, too large, or not an image.
+    An orientation tag is not applied: the depth has none, and the two would no longer match. Raises DataError if the
+    file (in errors: ``where``) is missing, truncated, damaged, too large, or not an image.
     """
     data, where = _load(source, where)
     if data[:4] in _TIFF:
@@ -43,17 +34,10 @@ def read_image(source: Path | bytes, *, where: str = "") -> NDArray[np.uint8]:
 
 
 def read_depth(source: Path | bytes, *, where: str = "") -> NDArray[np.generic]:
-    """Decode a depth map without changing its values: PNG of 8 or 16 bits, TIFF, or two-dimensional ``.npy``.
+    """Decode a depth map [H, W] without changing its values: PNG of 8 or 16 bits, TIFF, or two-dimensional ``.npy``.
 
-    Args:
-        source: a path, or the bytes of a PNG or TIFF.
-        where: names the file in errors; the path by default.
-
-    Returns:
-        [H, W] stored values.
-
-    Raises:
-        DataError: if the file is missing, truncated, damaged, too large, or has several different channels.
+    Takes a path, or the bytes of a PNG or TIFF. Raises DataError if the file (in errors: ``where``) is missing,
+    truncated, damaged, too large, or has several different channels.
     """
     if isinstance(source, Path) and source.suffix.lower() == ".npy":
         return _read_npy(source, where or f"'{source}'")
@@ -88,9 +72,7 @@ def image_size(data: bytes, *, where: str) -> tuple[int, int]:
     """Return (height, width) of a complete PNG, JPEG or TIFF without decoding it.
 
     Some releases of OpenCV fill what a truncated file lacks with grey, so the end of the file is looked for here.
-
-    Raises:
-        DataError: if the file is of another kind, truncated or damaged.
+    Raises DataError if the file is of another kind, truncated or damaged.
     """
     kinds = {_PNG: ("PNG", _png_size), _JPEG: ("JPEG", _jpeg_size)} | dict.fromkeys(_TIFF, ("TIFF", _tiff_size))
     kind, read_size = next((value for start, value in kinds.items() if data.startswith(start)), (None, None))
@@ -138,10 +120,9 @@ def _tiff_size(data: bytes) -> tuple[int, int]:
         entries = [struct.unpack_from(f"{order}HHI4s", data, start + 2 + 12 * i) for i in range(count)]
     except struct.error:
         raise EOFError("no directory") from None
-    sizes = {
-        tag: struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", value)[0] for tag, kind, _, value in entries
-    }
-    return sizes[257], sizes[256]
+    values = {tag: (f"{order}{'H' if kind == 3 else 'I'}", value) for tag, kind, _, value in entries}
+    height, width = (struct.unpack_from(*values[tag])[0] for tag in (257, 256))
+    return height, width
 
 
 def _read_npy(path: Path, where: str) -> NDArray[np.generic]:

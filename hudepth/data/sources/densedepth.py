@@ -41,12 +41,8 @@ class DenseDepthSource(Nyu, Source):
     - ``data/nyu2_test.csv``: ``data/nyu2_test/NNNNN_colors.png`` and ``NNNNN_depth.png``; the official
       test frames, 16-bit millimetres, scene unknown (empty).
 
-    ``encoding="auto"`` reads both correctly.
-
-    Args:
-        root: the zip file, the folder with the zip file, the unpacked folder, or its folder ``data``.
-        subset: ``train``, ``test`` or ``all``.
-        encoding: how depth values become metres.
+    ``encoding="auto"`` reads both correctly. ``root`` is the zip file, the folder with the zip file, the unpacked
+    folder, or its folder ``data``.
     """
 
     name: ClassVar[str] = "densedepth"
@@ -64,11 +60,8 @@ class DenseDepthSource(Nyu, Source):
 
     def records(self) -> Sequence[Record]:
         """List the pairs in order of the CSV files, which are read once; see :meth:`Source.records`."""
-        if not self._records:
-            self._records = self._read_lists()
-        return self._records
-
-    def _read_lists(self) -> list[Record]:
+        if self._records:
+            return self._records
         records: list[Record] = []
         lines: dict[str, int] = {}
         for split in self._splits():
@@ -84,6 +77,7 @@ class DenseDepthSource(Nyu, Source):
                     raise DataError(f"{where}: '{record.id}' is already on line {lines[record.id]}. Remove one.")
                 lines[record.id] = line
                 records.append(record)
+        self._records = records
         return records
 
     def read(self, record: Record) -> RawPair:
@@ -149,14 +143,9 @@ def _record(cells: Sequence[str], split: str, where: str) -> Record:
     if (scene, number) != (depth["scene"], depth["number"]):
         raise DataError(f"{where}: '{image[0]}' and '{depth[0]}' are of different frames. Copy the list again.")
     return Record(
-        id=f"{scene or split}/{number}",
-        scene=scene,
-        frame=int(number),
-        split=split,
-        category=category_of(scene),
-        image=image[0],
-        depth=depth[0],
-    )
+        id=f"{scene or split}/{number}", scene=scene, frame=int(number), split=split, category=category_of(scene),
+        image=image[0], depth=depth[0],
+    )  # fmt: skip
 
 
 def _open(path: Path) -> zipfile.ZipFile:

@@ -18,9 +18,7 @@ from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.sources.decoding import read_depth, read_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-"""Extensions of images, in lower case."""
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
-"""Extensions of depth maps, in lower case."""
 
 Handle = TypeVar("Handle")
 
@@ -30,16 +28,12 @@ class FileSource(Source):
 
     @abstractmethod
     def folder(self) -> Path:
-        """Return the folder of the files.
-
-        Raises:
-            DataError: if it is missing.
-        """
+        """Return the folder of the files; DataError if it is missing."""
 
     def read(self, record: Record) -> RawPair:
         """Decode the two files of a pair; see :meth:`Source.read`."""
-        folder = self.folder()
-        return read_pair(*(inside(folder, name, where="data.root") for name in (record.image, record.depth)))
+        image, depth = (inside(self.folder(), name, where="data.root") for name in (record.image, record.depth))
+        return make_pair(read_image(image), read_depth(depth), image_where=f"'{image}'", depth_where=f"'{depth}'")
 
     def files(self) -> Sequence[Path]:
         """Return every image and depth map."""
@@ -68,15 +62,9 @@ class PerProcess(Generic[Handle]):
 
 
 def inside(root: Path, name: str, *, where: str) -> Path:
-    """Return the path of ``name`` below ``root``. Only the name is checked: links are followed.
+    """Return the path of an untrusted ``name`` below ``root``. Only the name is checked: links are followed.
 
-    Args:
-        root: a folder.
-        name: relative path from an untrusted index.
-        where: names the index in errors.
-
-    Raises:
-        DataError: if the name is empty, absolute, or leaves the folder by ``..``.
+    Raises DataError if the name is empty, absolute, or leaves the folder by ``..``; ``where`` names the index.
     """
     windows = PureWindowsPath(name)
     parts = {*PurePosixPath(name).parts, *windows.parts}
@@ -88,8 +76,7 @@ def inside(root: Path, name: str, *, where: str) -> Path:
 def csv_rows(data: bytes, *, where: str) -> list[tuple[int, list[str]]]:
     """Return (line number, cells) for each line of a CSV file that is not blank, whatever its line ends.
 
-    Raises:
-        DataError: if it is not UTF-8 text or not a CSV.
+    Raises DataError if it is not UTF-8 text or not a CSV.
     """
     try:
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
@@ -99,11 +86,7 @@ def csv_rows(data: bytes, *, where: str) -> list[tuple[int, list[str]]]:
 
 
 def make_pair(image: NDArray[np.uint8], depth: NDArray[np.generic], *, image_where: str, depth_where: str) -> RawPair:
-    """Join an image and its depth.
-
-    Raises:
-        DataError: if they differ in size.
-    """
+    """Join an image and its depth; DataError if they differ in size."""
     if image.shape[:2] != depth.shape:
         (height, width), (rows, columns) = image.shape[:2], depth.shape
         raise DataError(
@@ -111,12 +94,3 @@ def make_pair(image: NDArray[np.uint8], depth: NDArray[np.generic], *, image_whe
             "Both must have one size."
         )
     return RawPair(image=image, depth=depth)
-
-
-def read_pair(image: Path, depth: Path) -> RawPair:
-    """Decode the two files of a pair.
-
-    Raises:
-        DataError: as :func:`read_image`, :func:`read_depth` and :func:`make_pair`.
-    """
-    return make_pair(read_image(image), read_depth(depth), image_where=f"'{image}'", depth_where=f"'{depth}'")

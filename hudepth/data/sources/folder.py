@@ -23,14 +23,8 @@ class FolderSource(FileSource):
     ``01_depth.png``. Images are JPEG or PNG; depth maps are PNG of 8 or 16 bits, two-dimensional ``.npy``,
     or TIFF. Files of other kinds are ignored.
 
-    Args:
-        root: the folder that holds both.
-        images: folder of the images, relative to ``root``.
-        depths: folder of the depth maps, likewise.
-        image_suffix: end of an image's name, before its extension.
-        depth_suffix: end of a depth map's name, likewise.
-        encoding: how depth values become metres; required, since the files do not state it.
-        indoor: whether depths must be plausible for rooms.
+    ``images`` and ``depths`` are relative to ``root``; suffixes end a name before its extension. ``encoding`` is
+    required, since the files do not state it.
     """
 
     name: ClassVar[str] = "folder"
@@ -52,13 +46,10 @@ class FolderSource(FileSource):
                 f"data.encoding is not set, and a folder does not state its unit. Pass one of {', '.join(ENCODINGS)}."
             )
         images, depths = self._find(root)
-        expects = (
-            f"'{self.images}/<name>{self.image_suffix}.jpg' "
-            f"with '{self.depths}/<name>{self.depth_suffix}.png' (or .npy, .tif)"
-        )
+        expects = f"'{self.images}/<name>{self.image_suffix}.jpg' with '{self.depths}/<name>{self.depth_suffix}.png'"
         frames: dict[str, int] = {}
         records = []
-        for key, image, depth in pair_up(images, depths, root=root, expects=expects):
+        for key, image, depth in pair_up(images, depths, root=root, expects=f"{expects} (or .npy, .tif)"):
             scene = PurePosixPath(key).parent.as_posix().removeprefix(".")
             frames[scene] = frames.get(scene, -1) + 1
             records.append(Record(id=key, scene=scene, frame=frames[scene], image=image, depth=depth))

@@ -38,13 +38,8 @@ class ManifestSource(FileSource):
     depth_offset      optional, in units of the stored value; 0 where empty
     ================= ========================================================================================
 
-    Paths must stay inside the folder.
-
-    Args:
-        root: the folder, or the CSV file itself.
-        manifest: name of the CSV file within the folder.
-        encoding: how depth values become metres.
-        indoor: whether depths must be plausible for rooms.
+    Paths must stay inside the folder. ``root`` is the folder, or the CSV file itself; ``manifest`` is the name of the
+    CSV file within the folder.
     """
 
     name: ClassVar[str] = "manifest"
@@ -109,20 +104,17 @@ class ManifestSource(FileSource):
         if split not in _SPLITS:
             raise DataError(f"{where}: unknown split '{split}'. Write train, test, or nothing.")
         frames[scene] = frames.get(scene, -1) + 1
+        frame = row.get("frame") or str(frames[scene])
+        if not (frame.isascii() and frame.isdigit() and len(frame) < 19):
+            raise DataError(f"{where}: frame is '{frame}'. Write a whole number, or leave the cell empty.")
         scale_m = _number(row, "depth_scale_m", where)
         if scale_m is not None and scale_m <= 0:
             raise DataError(f"{where}: depth_scale_m is {scale_m:g}. Write a positive number of metres.")
         return Record(
-            id=self._row_id(row),
-            scene=scene,
-            frame=_whole(row, "frame", where, otherwise=frames[scene]),
-            split=split,
-            category=row.get("category", ""),
-            image=row["image"],
-            depth=row["depth"],
-            depth_scale_m=scale_m,
-            depth_offset=_number(row, "depth_offset", where) or 0.0,
-        )
+            id=self._row_id(row), scene=scene, frame=int(frame), split=split, category=row.get("category", ""),
+            image=row["image"], depth=row["depth"],
+            depth_scale_m=scale_m, depth_offset=_number(row, "depth_offset", where) or 0.0,
+        )  # fmt: skip
 
     def _row_id(self, row: Mapping[str, str]) -> str:
         return row.get("id") or row.get("index") or str(Path(row["image"]).with_suffix("").as_posix())
@@ -145,8 +137,7 @@ class NyuLabeledSource(Nyu, ManifestSource):
 
 
 def _number(row: Mapping[str, str], column: str, where: str) -> float | None:
-    text = row.get(column)
-    if not text:
+    if not (text := row.get(column)):
         return None
     try:
         value = float(text)
@@ -155,10 +146,3 @@ def _number(row: Mapping[str, str], column: str, where: str) -> float | None:
     if not math.isfinite(value):
         raise DataError(f"{where}: {column} is '{text}'. Write a finite number, or leave the cell empty.")
     return value
-
-
-def _whole(row: Mapping[str, str], column: str, where: str, *, otherwise: int) -> int:
-    text = row.get(column) or str(otherwise)
-    if not (text.isascii() and text.isdigit() and len(text) < 19):
-        raise DataError(f"{where}: {column} is '{text}'. Write a whole number, or leave the cell empty.")
-    return int(text)

@@ -29,12 +29,8 @@ class NyuMatSource(nyu.Nyu, Source):
     An HDF5 file with MATLAB's header (Silberman, Hoiem, Kohli and Fergus, ECCV 2012). All arrays are
     transposed: ``images`` [N, 3, W, H] uint8, ``depths`` (in-painted) and ``rawDepths`` (0 where the sensor
     measured nothing) [N, W, H] float32 metres, ``scenes`` [1, N] references to names. The official split, 795
-    training and 654 test pairs, is known; a file with another number of pairs has none.
-
-    Args:
-        root: the file, or the folder that holds it.
-        depth: ``depths`` or ``rawDepths``.
-        encoding: how depth values become metres.
+    training and 654 test pairs, is known; a file with another number of pairs has none. ``root`` is the file, or the
+    folder that holds it.
     """
 
     name: ClassVar[str] = "nyu_mat"
@@ -57,17 +53,12 @@ class NyuMatSource(nyu.Nyu, Source):
         records = []
         for index, scene in enumerate(_scenes(self._handle.get(path), images, path)):
             frames[scene] = frames.get(scene, -1) + 1
-            records.append(
-                Record(
-                    id=f"{index:05d}",
-                    scene=scene,
-                    frame=frames[scene],
-                    split="" if test is None else "test" if index in test else "train",
-                    category=nyu.category_of(scene),
-                    image=f"images/{index:05d}",
-                    depth=f"{self.depth}/{index:05d}",
-                )
-            )
+            name, split = f"{index:05d}", "" if test is None else "test" if index in test else "train"
+            record = Record(
+                name, scene, frames[scene], split=split, category=nyu.category_of(scene),
+                image=f"images/{name}", depth=f"{self.depth}/{name}",
+            )  # fmt: skip
+            records.append(record)
         return records
 
     def read(self, record: Record) -> RawPair:
@@ -117,9 +108,8 @@ def _dataset(file: h5py.File, name: str, kind: str, ndim: int, path: Path) -> h5
     if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         raise DataError(f"'{path}': no array '{name}'. Pass data.root=<path of {_FILE}>.")
     if found.ndim != ndim or not found.dtype.str[1:].startswith(kind) or (ndim == 4 and found.shape[1] != 3):
-        raise DataError(
-            f"'{path}': '{name}' is {found.dtype} of shape {found.shape}. Pass data.root=<path of {_FILE}>."
-        )
+        what = f"'{name}' is {found.dtype} of shape {found.shape}"
+        raise DataError(f"'{path}': {what}. Pass data.root=<path of {_FILE}>.")
     check_pixels(found.shape[-1], found.shape[-2], where=f"'{path}' {name}")
     if found.chunks and np.prod(found.chunks, dtype=float) > 3 * MAX_PIXELS:  # a chunk is decompressed as a whole
         raise DataError(f"'{path}': '{name}' has chunks of {found.chunks} values. Repack the file.")
@@ -129,11 +119,8 @@ def _dataset(file: h5py.File, name: str, kind: str, ndim: int, path: Path) -> h5
 def _scenes(file: h5py.File, images: h5py.Dataset, path: Path) -> list[str]:
     table = file.get("scenes") if isinstance(file.get("scenes", getlink=True), h5py.HardLink) else None
     count = len(images)
-    if (
-        not isinstance(table, h5py.Dataset)
-        or h5py.check_ref_dtype(table.dtype) is not h5py.Reference
-        or table.size != count
-    ):
+    known = isinstance(table, h5py.Dataset) and h5py.check_ref_dtype(table.dtype) is h5py.Reference
+    if not known or table.size != count:
         raise DataError(f"'{path}': no {count} scene names in 'scenes'. Pass data.root=<path of {_FILE}>.")
     return [_text(file, reference, path) for reference in table[()].ravel()]
 

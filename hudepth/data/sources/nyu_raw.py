@@ -24,11 +24,7 @@ class NyuRawSource(nyu.Nyu, FileSource):
     """Raw NYU frames as BTS (Lee et al., 2019) and its successors train on them.
 
     ``rgb_XXXXX.jpg`` and ``sync_depth_XXXXX.png``, 640 x 480, 16-bit millimetres, 0 where the sensor measured
-    nothing; either in the folder itself or in one folder per scene below it. Other files are ignored.
-
-    Args:
-        root: the folder.
-        encoding: how depth values become metres.
+    nothing; either in the folder ``root`` itself or in one folder per scene below it. Other files are ignored.
     """
 
     name: ClassVar[str] = "nyu_raw"

@@ -15,16 +15,11 @@ def walk_files(root: Path) -> Iterator[PurePosixPath]:
     for folder, folders, names in os.walk(root):
         folders.sort()
         inner = PurePosixPath(Path(folder).relative_to(root).as_posix())
-        for name in sorted(names):
-            yield inner / name
+        yield from (inner / name for name in sorted(names))
 
 
 def unique_keys(files: Iterable[tuple[str, str]], *, what: str) -> dict[str, str]:
-    """Return the path of each key, of (key, path) pairs.
-
-    Raises:
-        DataError: if two files have the same key.
-    """
+    """Return the path of each key, of (key, path) pairs; DataError if two files have the same key."""
     found: dict[str, str] = {}
     for key, path in files:
         if key in found:
@@ -36,16 +31,9 @@ def unique_keys(files: Iterable[tuple[str, str]], *, what: str) -> dict[str, str
 def pair_up(
     images: Mapping[str, str], depths: Mapping[str, str], *, root: Path, expects: str
 ) -> list[tuple[str, str, str]]:
-    """Return (key, image, depth) for each key, in natural order: ``frame_2`` comes before ``frame_10``.
+    """Return (key, image, depth) for each key of both, in natural order: ``frame_2`` comes before ``frame_10``.
 
-    Args:
-        images: path of each image by key.
-        depths: path of each depth map by key.
-        root: their folder, for errors.
-        expects: what names should look like, for errors.
-
-    Raises:
-        DataError: if there are none, or one has no partner.
+    Raises DataError, with their folder ``root`` and the names it ``expects``, if there are none or one has no partner.
     """
     if not images and not depths:
         raise DataError(f"data.root: no pairs in '{root}'. Expected {expects}.")

@@ -48,8 +48,7 @@ class RoomsSource(Source):
         holes: remove depth (0) where a Kinect would not measure: in its projector's shadow, on grazing and
             dark surfaces, beyond 8 m, along the border, and in blobs. Everything else stays the same.
 
-    Raises:
-        ConfigError: if an option is out of range.
+    Raises ConfigError if an option is out of range.
     """
 
     name: ClassVar[str] = "rooms"
@@ -59,15 +58,9 @@ class RoomsSource(Source):
     encoding: str = "float_m"
 
     def __init__(
-        self,
-        *,
-        scenes: int = 48,
-        frames_per_scene: int = 5,
-        size: int | Sequence[int] = (240, 320),
-        seed: int = 0,
-        variety: str = "usual",
-        holes: bool = False,
-    ) -> None:
+        self, *, scenes: int = 48, frames_per_scene: int = 5, size: int | Sequence[int] = (240, 320), seed: int = 0,
+        variety: str = "usual", holes: bool = False,
+    ) -> None:  # fmt: skip
         self.scenes: int = convert("data.source.scenes", scenes, _COUNT)
         self.frames_per_scene: int = convert("data.source.frames_per_scene", frames_per_scene, _COUNT)
         self.size: tuple[int, int] = convert("data.source.size", size, _SIZE)
@@ -87,8 +80,7 @@ class RoomsSource(Source):
     def read(self, record: Record) -> RawPair:
         """Render one frame: image [H, W, 3] uint8 RGB, depth [H, W] float32 z-depth [m], 0 only in holes.
 
-        Raises:
-            DataError: if the record is not one of this source's.
+        Raises DataError if the record is not one of this source's.
         """
         scene = self._scene_number(record)
         room = build_room(self.seed, scene, self.variety)
@@ -129,11 +121,8 @@ class RoomsSource(Source):
 def kinect_holes(depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return where a Kinect would measure nothing, [H, W].
 
-    Args:
-        depth: [H, W] exact depth [m].
-        image: [H, W, 3] RGB.
-        fx: focal length [pixels].
-        rng: draws which of the doubtful pixels fail.
+    Takes exact depth [H, W] in metres, the image [H, W, 3] and the focal length ``fx`` [pixels]; ``rng`` draws which of
+    the doubtful pixels fail.
     """
     height, width = depth.shape
     # The projector sits next to the camera: a pixel is in shadow if one right of it is lit from further left.
@@ -149,9 +138,8 @@ def kinect_holes(depth: F32, image: NDArray[np.uint8], *, fx: float, rng: np.ran
     grazing = slope > 6 - 4 * patches
     dark = image.max(2) < 55 * patches
     blobs = patches > 0.93
-    border = np.zeros(depth.shape, np.bool_)
+    border = np.ones(depth.shape, np.bool_)
     edge_y, edge_x = max(1, round(height / 60)), max(1, round(width / 60))
-    border[:edge_y] = border[-edge_y:] = True
-    border[:, :edge_x] = border[:, -edge_x:] = True
+    border[edge_y:-edge_y, edge_x:-edge_x] = False
     holes: NDArray[np.bool_] = shadow | grazing | dark | blobs | border | (depth > _KINECT_RANGE_M)
     return holes
