@@ -23,7 +23,7 @@ _SPANS = ("zoom", "gamma", "brightness", "contrast", "saturation")
 
 @dataclass(kw_only=True, eq=False)
 class Augmentation:
-    """Random changes of training pairs, drawn for each image. By default nothing changes.
+    """Random changes of training pairs, drawn for each image; by default none. ConfigError for values out of range.
 
     Args:
         flip: probability of swapping left and right.
@@ -32,10 +32,8 @@ class Augmentation:
         zoom_depth: divide depth by the zoom, as a fixed camera would see it.
         rotate_deg: largest roll of the camera, either way [degrees]; at most 45.
         border: share of each side that is cut off, in [0, 0.4]; 0.02 covers the white frame of NYU's labelled set.
-        gamma: range of the exponent of colours in [0, 1].
-        brightness: range of their factor.
-        contrast: range of the factor of their difference from the image's mean.
-        saturation: range of the factor of their difference from grey.
+        gamma, brightness: ranges of the exponent and the factor of colours in [0, 1].
+        contrast, saturation: ranges of the factors of their difference from the image's mean and from grey.
         tint: each channel's factor is within 1 - tint and 1 + tint.
         grey: probability of removing all colour.
         noise: largest standard deviation of noise, of colours in [0, 1].
@@ -43,7 +41,6 @@ class Augmentation:
         cut_depth: probability of showing the ground truth in a box of the image.
         cut_depth_size: largest share of what is right of and below the box's corner that the box takes.
 
-    Raises ConfigError for values out of range.
     """
 
     flip: _Share = 0.0
@@ -88,7 +85,6 @@ class Augmentation:
         Args:
             image: RGB in [0, 1].
             unit_depth: depth / max_depth_m, not clipped, 0 where unmeasured: the ground truth, then a teacher's depth.
-            size: (height, width).
             aspect: width over height of the scene.
             generator: of the CPU, whatever device the batch is on: the same draws everywhere.
         """

@@ -93,10 +93,13 @@ class DepthDataModule(LightningDataModule):
     @cached_property
     def store(self) -> DepthStore:
         """The depth store, prepared if necessary."""
-        return prepare(
-            self.source, size=self.size, cache=self.cache, native=self.native, on_error=self.on_error,
-            workers=self.prepare_workers,
-        )  # fmt: skip
+        options: dict[str, Any] = {
+            "size": self.size,
+            "cache": self.cache,
+            "native": self.native,
+            "on_error": self.on_error,
+        }
+        return prepare(self.source, **options, workers=self.prepare_workers)
 
     @cached_property
     def split(self) -> Split:
@@ -107,7 +110,8 @@ class DepthDataModule(LightningDataModule):
     @cached_property
     def teacher(self) -> TeacherDepths | None:
         """The teacher's depths of the training pairs, prepared if necessary; None without a teacher."""
-        return self.teacher_folder and TeacherDepths(self.teacher_folder, self.store, self.split.train)
+        folder = self.teacher_folder
+        return None if folder is None else TeacherDepths(folder, self.store, self.split.train)
 
     def prepare_data(self) -> None:
         """Build the depth store and read the teacher's depths."""
@@ -180,9 +184,14 @@ class DepthDataModule(LightningDataModule):
 
     def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
         return DataLoader(
-            dataset, self.batch_size, sampler=sampler, num_workers=self.num_workers, collate_fn=as_is,
-            pin_memory=torch.cuda.is_available(), persistent_workers=self.num_workers > 0,
-        )  # fmt: skip
+            dataset,
+            self.batch_size,
+            sampler=sampler,
+            num_workers=self.num_workers,
+            collate_fn=as_is,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.num_workers > 0,
+        )
 
     def _shard(self) -> tuple[int, int]:
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)

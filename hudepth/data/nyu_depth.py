@@ -51,9 +51,14 @@ class NYUDepth(Dataset[dict[str, Any]]):
     """
 
     def __init__(
-        self, root: str | Path, split: str = "train", *, size: int | Sequence[int] | None = None,
-        max_depth_m: float = 10.0, seed: int = 42,
-    ) -> None:  # fmt: skip
+        self,
+        root: str | Path,
+        split: str = "train",
+        *,
+        size: int | Sequence[int] | None = None,
+        max_depth_m: float = 10.0,
+        seed: int = 42,
+    ) -> None:
         subset = convert("split", split, Annotated[str, Choice(SUBSETS)])
         self.size: tuple[int, int] | None = convert("size", size, Size | None)
         self.max_depth_m: float = convert("max_depth_m", max_depth_m, Annotated[float, Range(0, above=True)])
@@ -81,8 +86,10 @@ class NYUDepth(Dataset[dict[str, Any]]):
         return {
             "image": torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1).contiguous(),
             "depth": torch.from_numpy(np.where(valid, depth, np.float32(0)))[None],
-            "valid": torch.from_numpy(valid)[None], "id": record.id, "scene": record.scene,
-        }  # fmt: skip
+            "valid": torch.from_numpy(valid)[None],
+            "id": record.id,
+            "scene": record.scene,
+        }
 
     def plot(self, sample: dict[str, Any], *, title: str | None = None) -> Figure:
         """Draw a sample: the image, its depth, and ``sample["prediction"]`` [1, h, w] in metres if there is one.

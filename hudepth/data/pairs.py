@@ -46,9 +46,13 @@ class PreparedPair:
 def read_metres(source: Source, record: Record, raw: NDArray[np.generic]) -> NDArray[np.float32]:
     """Turn a pair's stored depth into metres, 0 where unmeasured; DataError if the encoding does not fit it."""
     return to_metres(
-        raw, source.encoding, scale_m=record.depth_scale_m, offset=record.depth_offset,
-        auto_uint8=source.auto_uint8, where=record.depth or record.id,
-    )  # fmt: skip
+        raw,
+        source.encoding,
+        scale_m=record.depth_scale_m,
+        offset=record.depth_offset,
+        auto_uint8=source.auto_uint8,
+        where=record.depth or record.id,
+    )
 
 
 def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair:

@@ -64,9 +64,14 @@ def build_once(path: Path, build: Callable[[Path], None]) -> None:
 
 
 def prepare(
-    source: Source, *, size: tuple[int, int], cache: str | Path, native: bool = True, on_error: str = "raise",
+    source: Source,
+    *,
+    size: tuple[int, int],
+    cache: str | Path,
+    native: bool = True,
+    on_error: str = "raise",
     workers: int | None = None,
-) -> DepthStore:  # fmt: skip
+) -> DepthStore:
     """Return the depth store of ``source``, and prepare it first if it does not exist.
 
     Safe to call from several jobs at once. A call that is killed leaves no store. Raises ConfigError for an unknown

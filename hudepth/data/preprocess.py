@@ -13,9 +13,12 @@ from hudepth.data.warp import resize
 
 
 def preprocess(
-    batch: RawBatch, *, max_depth_m: float, size: tuple[int, int] | None = None,
+    batch: RawBatch,
+    *,
+    max_depth_m: float,
+    size: tuple[int, int] | None = None,
     augment: Callable[..., tuple[Tensor, Tensor]] | None = None,
-) -> Batch:  # fmt: skip
+) -> Batch:
     """Normalise a batch: ImageNet statistics for the image; depth divided, clipped, masked.
 
     Args:

@@ -121,13 +121,11 @@ def _official(records: Sequence[Record], seed: int, fractions: Sequence[float]) 
             f"data.split=official: {unknown} of {len(records)} pairs are in neither 'train' nor 'test' of the set's "
             "own split. Pass data.split=scene or data.split=random."
         )
-    own_train = [i for i, record in enumerate(records) if record.split == "train"]
-    test = [i for i, record in enumerate(records) if record.split == "test"]
+    own_train, test = ([i for i, record in enumerate(records) if record.split == name] for name in ("train", "test"))
     share = fractions[0] + fractions[1]
     if not own_train or not share:
         return [], [], test
-    train, val = _by_scene(records, own_train, seed, [fractions[0] / share, fractions[1] / share])
-    return train, val, test
+    return *_by_scene(records, own_train, seed, [fractions[0] / share, fractions[1] / share]), test
 
 
 _KINDS: Mapping[str, Callable[[Sequence[Record], int, Sequence[float]], tuple[list[int], ...]]] = {

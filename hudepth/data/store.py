@@ -84,9 +84,12 @@ class StoreWriter:
         self._records: list[Record] = []
 
     def append(
-        self, record: Record, image: NDArray[np.uint8], depth_mm: NDArray[np.uint16],
+        self,
+        record: Record,
+        image: NDArray[np.uint8],
+        depth_mm: NDArray[np.uint16],
         native_png: NDArray[np.uint8] | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Add one pair at training size, with its native ground truth as an encoded 16-bit PNG.
 
         Raises ValueError if the pair has native ground truth and the store has none, or vice versa.

@@ -30,9 +30,13 @@ class Geometry:
 
 
 def warp(
-    image: Float[Tensor, "b 3 h w"], depth: Float[Tensor, "b d h w"], geometry: Geometry, *,
-    size: tuple[int, int], aspect: float,
-) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:  # fmt: skip
+    image: Float[Tensor, "b 3 h w"],
+    depth: Float[Tensor, "b d h w"],
+    geometry: Geometry,
+    *,
+    size: tuple[int, int],
+    aspect: float,
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
     """Crop, zoom, roll and flip images and depths (0 where unmeasured) in any units, and resize them to ``size``.
 
     Images are interpolated linearly; depth takes the nearest pixel, since the mean of two surfaces is the depth of

@@ -51,9 +51,9 @@ def read_depth(source: Path | bytes, *, where: str = "") -> NDArray[np.generic]:
 
 
 def _load(source: Path | bytes, where: str) -> tuple[bytes, str]:
-    if isinstance(source, bytes):
-        return source, where or "image data"
-    return read_bytes(source), where or f"'{source}'"
+    return (
+        (source, where or "image data") if isinstance(source, bytes) else (read_bytes(source), where or f"'{source}'")
+    )
 
 
 def _decode(data: bytes, flags: int, where: str) -> NDArray[Any]:

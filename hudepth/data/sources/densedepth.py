@@ -21,7 +21,6 @@ from hudepth.data.sources.nyu import Nyu, category_of
 
 MAX_MEMBER_BYTES = 64 << 20
 """Larger members of the zip file are refused before they are decompressed."""
-
 _ZIP = "nyu_data.zip"
 _LISTS = {"train": "nyu2_train.csv", "test": "nyu2_test.csv"}
 _FRAME = {
@@ -135,17 +134,21 @@ def _below(folder: Path, name: str) -> Path:
 def _record(cells: Sequence[str], split: str, where: str) -> Record:
     frames = [_FRAME[split].fullmatch(cell.strip()) for cell in cells]
     if len(frames) != 2 or frames[0] is None or frames[1] is None:
-        raise DataError(
-            f"{where}: {','.join(cells)[:120]!r} is not a pair of DenseDepth's {split} set. Copy the list again."
-        )
+        found = ",".join(cells)[:120]
+        raise DataError(f"{where}: {found!r} is not a pair of DenseDepth's {split} set. Copy the list again.")
     image, depth = frames[0], frames[1]
     scene, number = image["scene"], image["number"]
     if (scene, number) != (depth["scene"], depth["number"]):
         raise DataError(f"{where}: '{image[0]}' and '{depth[0]}' are of different frames. Copy the list again.")
     return Record(
-        id=f"{scene or split}/{number}", scene=scene, frame=int(number), split=split, category=category_of(scene),
-        image=image[0], depth=depth[0],
-    )  # fmt: skip
+        id=f"{scene or split}/{number}",
+        scene=scene,
+        frame=int(number),
+        split=split,
+        category=category_of(scene),
+        image=image[0],
+        depth=depth[0],
+    )
 
 
 def _open(path: Path) -> zipfile.ZipFile:

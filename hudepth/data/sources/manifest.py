@@ -16,7 +16,6 @@ from hudepth.data.sources.files import FileSource, csv_rows, inside
 from hudepth.data.sources.nyu import Nyu
 
 _REQUIRED = ("image", "depth")
-_SPLITS = ("", "train", "test")
 
 
 @dataclass(eq=False)
@@ -101,7 +100,7 @@ class ManifestSource(FileSource):
         for column in _REQUIRED:
             inside(folder, row[column], where=where)
         scene, split = row.get("scene", ""), row.get("split", "")
-        if split not in _SPLITS:
+        if split not in ("", "train", "test"):
             raise DataError(f"{where}: unknown split '{split}'. Write train, test, or nothing.")
         frames[scene] = frames.get(scene, -1) + 1
         frame = row.get("frame") or str(frames[scene])
@@ -111,10 +110,16 @@ class ManifestSource(FileSource):
         if scale_m is not None and scale_m <= 0:
             raise DataError(f"{where}: depth_scale_m is {scale_m:g}. Write a positive number of metres.")
         return Record(
-            id=self._row_id(row), scene=scene, frame=int(frame), split=split, category=row.get("category", ""),
-            image=row["image"], depth=row["depth"],
-            depth_scale_m=scale_m, depth_offset=_number(row, "depth_offset", where) or 0.0,
-        )  # fmt: skip
+            id=self._row_id(row),
+            scene=scene,
+            frame=int(frame),
+            split=split,
+            category=row.get("category", ""),
+            image=row["image"],
+            depth=row["depth"],
+            depth_scale_m=scale_m,
+            depth_offset=_number(row, "depth_offset", where) or 0.0,
+        )
 
     def _row_id(self, row: Mapping[str, str]) -> str:
         return row.get("id") or row.get("index") or str(Path(row["image"]).with_suffix("").as_posix())

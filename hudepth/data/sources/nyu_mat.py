@@ -55,9 +55,14 @@ class NyuMatSource(nyu.Nyu, Source):
             frames[scene] = frames.get(scene, -1) + 1
             name, split = f"{index:05d}", "" if test is None else "test" if index in test else "train"
             record = Record(
-                name, scene, frames[scene], split=split, category=nyu.category_of(scene),
-                image=f"images/{name}", depth=f"{self.depth}/{name}",
-            )  # fmt: skip
+                name,
+                scene,
+                frames[scene],
+                split=split,
+                category=nyu.category_of(scene),
+                image=f"images/{name}",
+                depth=f"{self.depth}/{name}",
+            )
             records.append(record)
         return records
 
@@ -117,7 +122,7 @@ def _dataset(file: h5py.File, name: str, kind: str, ndim: int, path: Path) -> h5
 
 
 def _scenes(file: h5py.File, images: h5py.Dataset, path: Path) -> list[str]:
-    table = file.get("scenes") if isinstance(file.get("scenes", getlink=True), h5py.HardLink) else None
+    table: Any = file.get("scenes") if isinstance(file.get("scenes", getlink=True), h5py.HardLink) else None
     count = len(images)
     known = isinstance(table, h5py.Dataset) and h5py.check_ref_dtype(table.dtype) is h5py.Reference
     if not known or table.size != count:

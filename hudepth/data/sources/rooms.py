@@ -39,8 +39,7 @@ class RoomsSource(Source):
     ``seed``, scene, frame and ``size``.
 
     Args:
-        scenes: number of rooms, at least 1. The last fifth (at least one room of two) is the ``test`` split.
-        frames_per_scene: at least 1.
+        scenes: number of rooms. The last fifth (at least one room of two) is the ``test`` split.
         size: (height, width) in pixels, each 16 to 2048; the field of view is always NYU's.
         seed: at least 0; each seed gives other rooms.
         variety: ``usual``, or ``wide``: more sizes of rooms, fuller, seen from more distances, heights and angles. Use
@@ -58,9 +57,15 @@ class RoomsSource(Source):
     encoding: str = "float_m"
 
     def __init__(
-        self, *, scenes: int = 48, frames_per_scene: int = 5, size: int | Sequence[int] = (240, 320), seed: int = 0,
-        variety: str = "usual", holes: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        *,
+        scenes: int = 48,
+        frames_per_scene: int = 5,
+        size: int | Sequence[int] = (240, 320),
+        seed: int = 0,
+        variety: str = "usual",
+        holes: bool = False,
+    ) -> None:
         self.scenes: int = convert("data.source.scenes", scenes, _COUNT)
         self.frames_per_scene: int = convert("data.source.frames_per_scene", frames_per_scene, _COUNT)
         self.size: tuple[int, int] = convert("data.source.size", size, _SIZE)
