@@ -30,17 +30,15 @@ _COUNT = Annotated[int, Range(1)]
 
 
 class DepthDataModule(LightningDataModule):
-    """Batches of image, unit depth and valid mask for training, validation and test.
+    """Batches of image, unit depth and valid mask. Raises ConfigError for values out of range.
 
     Args:
-        source: the data set.
         size: (height, width) of training images, or one number for a square; the paper's is 224 x 224.
         split, split_seed, fractions: see :func:`hudepth.data.splits.make_split`; by default the paper's.
         max_depth_m: maximum depth [m] (the paper: 10); depth is clipped to it and divided by it.
         batch_size: pairs per step (the paper: 8).
         progressive: smaller sizes to start with, each until a share of the epochs:
             ``[{size: [112, 112], until: 0.4}]``; see :func:`hudepth.data.resolution.read_stages`.
-        augment: random changes of training pairs.
         teacher: folder of another model's depths; see :class:`hudepth.data.teacher.TeacherDepths`.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
         seed: of the order of training pairs and of augmentation, which depend only on it and the epoch.
@@ -48,7 +46,6 @@ class DepthDataModule(LightningDataModule):
             within a few blocks; see :class:`hudepth.data.dataset.BlockShuffle`.
         cache, native, on_error, prepare_workers: of the depth store; see :func:`hudepth.data.prepare.prepare`.
 
-    Raises ConfigError for values out of range.
     """
 
     def __init__(
@@ -93,13 +90,8 @@ class DepthDataModule(LightningDataModule):
     @cached_property
     def store(self) -> DepthStore:
         """The depth store, prepared if necessary."""
-        options: dict[str, Any] = {
-            "size": self.size,
-            "cache": self.cache,
-            "native": self.native,
-            "on_error": self.on_error,
-        }
-        return prepare(self.source, **options, workers=self.prepare_workers)
+        kept = partial(prepare, size=self.size, cache=self.cache, native=self.native, on_error=self.on_error)
+        return kept(self.source, workers=self.prepare_workers)
 
     @cached_property
     def split(self) -> Split:

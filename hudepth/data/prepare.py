@@ -78,10 +78,8 @@ def prepare(
     ``on_error``; DataError for bad pairs, implausible units, or a folder that cannot be written.
 
     Args:
-        source: the data set.
         size: (height, width) of images and depths in the store; images are averaged over areas, depths take the
             nearest pixel, since a mean of two surfaces is the depth of neither.
-        cache: folder of all stores.
         native: also keep the ground truth at its native resolution, for protocols like ``eigen``.
         on_error: ``raise`` at the first bad pair, or ``skip`` bad pairs and list them.
         workers: processes; one per core by default.

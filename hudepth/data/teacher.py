@@ -33,10 +33,8 @@ class TeacherDepths:
     Values that are not finite or not positive count as missing. Raises DataError if depths are missing, cannot be
     read, or are not of their images' size.
 
-    Args:
-        folder: with a file for each training pair: its id, then one of :data:`ENDINGS`.
-        store: of the pairs.
-        indices: the training pairs, as positions in the store.
+    ``folder`` has a file for each training pair: its id, then one of :data:`ENDINGS`; ``indices`` are the positions of
+    these pairs in the store.
     """
 
     def __init__(self, folder: str | Path, store: DepthStore, indices: Sequence[int]) -> None:
