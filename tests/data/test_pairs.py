@@ -135,7 +135,7 @@ def test_each_bad_pair_is_a_line_in_its_place() -> None:
 
 def test_a_mistaken_configuration_is_no_bad_pair() -> None:
     source = MemorySource([random_pair(4, 4)], encoding="milimetres")
-    with pytest.raises(ConfigError, match="data.encoding: 'milimetres'"):
+    with pytest.raises(ConfigError, match=r"data.encoding: 'milimetres'"):
         list(prepare_pairs(source, source.records(), (2, 2), native=False, workers=1))
 
 
