@@ -59,6 +59,7 @@ def test_a_mistake_gives_one_line_and_exit_code_1(
     assert list(tmp_path.rglob("*")) == []  # a mistake leaves nothing behind
 
 
+@pytest.mark.slow
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     done = run("test", "checkpoint=nowhere.ckpt", "debug=true", cwd=tmp_path)
     assert done.returncode == 1

@@ -48,8 +48,8 @@ def test_all_gpus_where_there_is_none(command: Command, tmp_path: Path) -> None:
         *(
             (
                 {"accelerator": accelerator, "devices": 2, "sync_batchnorm": True},
-                "trainer.sync_batchnorm: PyTorch has it on GPUs only. Pass trainer.sync_batchnorm=false, and each "
-                "process normalises by its own share of a batch.",
+                "trainer.sync_batchnorm: PyTorch supports it on GPUs only. Pass trainer.sync_batchnorm=false; then "
+                "each process normalises by its own share of a batch.",
             )
             for accelerator in ("cpu", "auto")
         ),

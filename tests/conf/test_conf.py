@@ -46,6 +46,7 @@ def test_every_choice_of_every_group_composes(group: str) -> None:
         assert composed(f"{group}={name}")[group]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", [f"{group}={name}" for group in ("experiment", "debug") for name in names(group)])
 def test_every_experiment_changes_something_and_runs_a_step(
     choice: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
@@ -63,6 +64,7 @@ def test_every_experiment_changes_something_and_runs_a_step(
     assert list(tmp_path.glob("runs/*/*/status.json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", names("model"))
 def test_every_model_trains_a_step_and_is_tested(
     model: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
@@ -86,6 +88,7 @@ def jobs_of(name: str, *typed: str) -> list[Job]:
     return compose_jobs(jobs, lambda overrides: composed(f"+sweep={name}", *overrides), str)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count"),
     [
@@ -106,6 +109,7 @@ def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> No
     assert f"{count} runs" in text
 
 
+@pytest.mark.slow
 def test_the_recipe_without_pretraining_is_the_recipe_where_there_is_none() -> None:
     labels = [job.labels["variant"] for job in jobs_of("recipe", "seed=1")]
     assert len(labels) == 12
@@ -129,6 +133,7 @@ def test_a_reading_of_badcl_changes_one_choice_at_a_time() -> None:
     assert [sum(loss[key] != paper[key] for key in paper) for loss in losses] == [0, 1, 1, 1, 1, 1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names("sweep"))
 def test_every_sweep_runs(
     name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch

@@ -74,6 +74,7 @@ def test_the_batch_size_changes_nothing(cache: Path, net: TinyUNet) -> None:
             torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-6, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_one_row_for_each_test_image(cache: Path, net: TinyUNet) -> None:
     data = make_data(cache)
     evaluation = evaluate(data, {"model": net, "other": TinyUNet(channels=2)}, PAPER, NATIVE)

@@ -13,6 +13,7 @@ import pytest
 from tests.commands import Command, script
 
 
+@pytest.mark.slow
 def test_figures_of_a_run(command: Command, trained: Path, tmp_path: Path) -> None:
     done = command("report", "figures", f"run={trained}", f"output={tmp_path / 'out'}", "panels=2")
     assert done.code == 0, done.err

@@ -119,6 +119,7 @@ def trials(folder: Path) -> list[optuna.trial.FrozenTrial]:
     return open_study(str(folder / "study.log")).trials
 
 
+@pytest.mark.slow
 def test_a_search_ends_with_its_best_trials_and_can_be_given_more(command: Command, tmp_path: Path) -> None:
     arguments = (SPACE, "optim.lr=choice(1e-3,1e-30)", "trainer.max_epochs=3")
     done = searched(command, *arguments, "hydra.sweeper.search.trials=4")

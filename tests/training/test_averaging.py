@@ -165,6 +165,7 @@ def test_a_decay_that_is_none(decay: float) -> None:
 # --- in a training ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_average_validates_and_is_kept_and_training_does_not_notice(cache: Path, tmp_path: Path) -> None:
     plain, watch = Watch(), Watch()
     fit(cache, tmp_path / "plain", [plain])

@@ -131,6 +131,7 @@ def test_early_stopping_and_schedules(command: Command, tmp_path: Path) -> None:
     assert len(history(only_run(tmp_path, "stop"))) == 2
 
 
+@pytest.mark.slow
 def test_resume_refuses_what_it_cannot_do(command: Command, trained: Path, tmp_path: Path) -> None:
     assert "run directory" in command("train", "resume=nowhere").err.splitlines()[-1]
     foreign = tmp_path / "foreign"

@@ -176,9 +176,8 @@ def test_early_stopping_waits_for_the_full_size(command: Command, tmp_path: Path
 
 def test_recomputed_activations_cannot_be_compiled(command: Command) -> None:
     done = command("train", *QUIET, "compile=true", "model=hybrid_unet", "model.recompute=true")
-    assert last_line(done.err) == (
-        "hudepth-train: compile: torch.compile cannot compile model.recompute. Leave one of them false."
-    )
+    assert last_line(done.err).startswith("hudepth-train: compile: ")
+    assert "model.recompute" in last_line(done.err)
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
@@ -197,6 +196,7 @@ def test_a_compiled_network_trains_to_the_same_and_its_checkpoint_is_like_any_ot
         torch.testing.assert_close(compiled_run.state[name], value, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_training_can_start_from_another_run(command: Command, tmp_path: Path) -> None:
     assert command("train", *QUIET, "name=first", "test=false").code == 0
     first = only_run(tmp_path, "first")

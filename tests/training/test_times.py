@@ -75,6 +75,7 @@ class StopAt(Callback):
             raise TrainingError("killed")
 
 
+@pytest.mark.slow
 def test_a_row_an_epoch(cache: Path, tmp_path: Path) -> None:
     fit(cache, tmp_path, [Slow(epoch=3, seconds=0.3)], progressive=[{"size": [16, 32], "until": 0.5}])
     assert (tmp_path / "times.csv").read_text().startswith(HEADER)

@@ -18,6 +18,7 @@ def few_small_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ledger_main, "ROOM_SIDE_PX", 48)
 
 
+@pytest.mark.slow
 def test_a_fresh_checkout_gives_the_whole_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ledger_main.main(["--no-throughput", "--output", str(tmp_path / "led")])
     ledger = json.loads((tmp_path / "led" / "ledger.json").read_text())
