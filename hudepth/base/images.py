@@ -1,4 +1,4 @@
-"""Photographs as people have them: any common format, upright, as RGB bytes; a stranger's file is read with care."""
+"""Photographs as people have them: any common format, upright, as RGB bytes. Files are untrusted."""
 
 from __future__ import annotations
 

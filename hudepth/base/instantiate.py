@@ -1,6 +1,6 @@
 """Turn plain configuration into objects, from trusted modules only.
 
-A configuration may come from a stranger's checkpoint, so a ``_target_`` is not imported unless it lies under a prefix
+A configuration may come from an untrusted checkpoint, so a ``_target_`` is not imported unless it lies under a prefix
 on the allow-list, and what it names must be a class that was defined there: ``hudepth.base.files.os.system`` is refused
 although its name starts well.
 """
@@ -25,7 +25,7 @@ def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type =
         config: plain Python: mappings with a ``_target_`` become objects, other mappings, lists and scalars stay.
         *args: positional arguments of the outermost object, for example an optimiser's parameters.
         trust: further modules whose classes may be named, for example ``["my_package"]``.
-        only: every class named, also a nested one, must be of this kind: what a stranger's configuration builds where
+        only: every class named, also a nested one, must be of this kind: what an untrusted configuration builds where
             a network is expected should not be something that writes files.
         **extra: keyword arguments of the outermost object, over those in ``config``.
 

@@ -17,7 +17,7 @@ LAUNCHERS = {
 
 
 def one_line(error: BaseException, task: str) -> str:
-    """Say an error in one line that names the mend.
+    """Return an error as one line that suggests a fix.
 
     Args:
         error: whatever was raised.

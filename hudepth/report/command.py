@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.instantiate import import_trusted
 from hudepth.base.options import convert, parse
 
 
@@ -16,6 +17,7 @@ def report(config: dict[str, Any]) -> None:
         if len(protocols) != 1:
             raise ConfigError(f"protocol: {verb} takes one, not {len(protocols)}. Pass protocol=eigen.")
         config["protocol"] = protocols[0]
+    import_trusted(convert("trust", config["trust"], list[str]))  # their metrics
     # each verb's imports are its own: a table needs neither matplotlib nor torch
     if verb == "compare":
         from hudepth.report.compare import CompareOptions, compare
