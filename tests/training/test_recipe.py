@@ -221,7 +221,8 @@ def test_a_start_with_another_largest_depth_is_named(command: Command, tmp_path:
         "train", *QUIET, "name=second", f"init={only_run(tmp_path, 'first')}", "data.max_depth_m=20", "test=false"
     )
     assert done.code == 0, done.err
-    assert "init: these weights answer in shares of 10.0 m, this training in shares of 20" in done.err
+    assert re.search(r"init: .*10\.0 m.*\n?.*20", done.err)
+    assert "data.max_depth_m=10.0" in done.err
     assert "Pass data.max_depth_m=10.0 to keep them." in done.err
 
 
@@ -247,7 +248,7 @@ def test_a_start_of_other_files_of_the_same_set_is_named(command: Command, tmp_p
         "train", *QUIET, "init=last", "paths.runs=elsewhere", "name=second", "data.source.seed=5", "test=false"
     )
     assert done.code == 0, done.err
-    assert "was trained on another set of rooms, or on other files of this one" in done.err
+    assert re.search(r"was trained on .*rooms", done.err)
 
 
 @pytest.mark.parametrize("damage", [{"before": "rooms"}, {"before": [1]}, {"split": {"kind": "random"}}])
@@ -263,7 +264,7 @@ def test_a_start_that_does_not_say_what_it_was_trained_on(
     torch.save(content, tmp_path / "alone.ckpt")
     done = command("train", *QUIET, f"init={tmp_path / 'alone.ckpt'}", "name=second")
     assert done.code == 1
-    assert re.search(r"does not say what it was trained on|named without its split", last_line(done.err))
+    assert re.search(r"it was trained on", last_line(done.err))
 
 
 @pytest.mark.slow
@@ -283,7 +284,7 @@ def test_each_look_at_the_test_images_is_kept(command: Command, tmp_path: Path) 
         (load_checkpoint(str(run)).epoch, "rooms", ["paper"])
     ]
     done = command("train", f"resume={run}", "trainer.max_epochs=3")
-    assert f"the test images of this run were looked at after epoch {looks[0]['epoch']}" in done.err
+    assert re.search(rf"tested after epoch {looks[0]['epoch']}", done.err)
     last = run / "checkpoints" / "last.ckpt"
     assert command("test", f"checkpoint={last}", "output=again", "protocol=paper", "baselines=false").code == 0
     metrics = json.loads((tmp_path / "again" / "paper" / "metrics.json").read_text())
@@ -299,7 +300,7 @@ def test_a_test_is_not_lost_because_it_cannot_be_noted(command: Command, tmp_pat
     (run / "scored.json").mkdir()
     done = command("test", f"checkpoint={run}", "output=results", "protocol=paper", "baselines=false")
     assert done.code == 0, done.err
-    assert f"'{run}' cannot note that its test images were looked at" in done.err
+    assert f"'{run}' cannot record" in done.err
     metrics = json.loads((tmp_path / "results" / "paper" / "metrics.json").read_text())
     assert metrics["checkpoint"]["scored_before"] is None
 
