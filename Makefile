@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+# each test process would compile every module again
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help install demo test test-all lint ledger format clean
 

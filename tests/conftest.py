@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import torch
 from filelock import FileLock
 from hypothesis import settings
 
-from tests.commands import TINY, Command, Result, script
+from tests.commands import TINY, Command, Result
 
 # pep484_tower: an int is welcome where a float is asked for, as in any YAML file
 jaxtyping.install_import_hook("hudepth", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
@@ -37,12 +36,16 @@ def nyu_root() -> Path:
     return root
 
 
+def _restore_logging(patch: pytest.MonkeyPatch) -> None:
+    """Undo in the end what a console script run in this process does to the log: its lines would come twice."""
+    log = logging.getLogger("hudepth")
+    patch.setattr(log, "handlers", list(log.handlers))
+    patch.setattr(log, "propagate", log.propagate)
+
+
 @pytest.fixture(autouse=True)
 def _own_logging(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Undo what a console script run in this process does to the log: other tests would see its lines twice."""
-    log = logging.getLogger("hudepth")
-    monkeypatch.setattr(log, "handlers", list(log.handlers))
-    monkeypatch.setattr(log, "propagate", log.propagate)
+    _restore_logging(monkeypatch)
 
 
 @pytest.fixture(scope="session")
@@ -60,21 +63,28 @@ def cache(shared: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def command(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
-    """Return a function that runs a console script's function in this process, in an empty folder."""
+def _run_script(task: str, *arguments: str) -> int:
+    """Run a console script's function in this process."""
     from hydra.core.global_hydra import GlobalHydra
 
     from hudepth import cli
 
+    GlobalHydra.instance().clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [f"hudepth-{task}", *arguments])
+        code: int = getattr(cli, task)()
+    return code
+
+
+@pytest.fixture
+def command(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """Return a function that runs a console script's function in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HUDEPTH_CACHE", str(cache))
 
     def run(task: str, *arguments: str) -> Result:
-        GlobalHydra.instance().clear()
-        monkeypatch.setattr(sys, "argv", [f"hudepth-{task}", *arguments])
         capfd.readouterr()
-        code = getattr(cli, task)()
+        code = _run_script(task, *arguments)
         captured = capfd.readouterr()
         return Result(code, captured.out, captured.err)
 
@@ -83,12 +93,14 @@ def command(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capfd:
 
 @pytest.fixture(scope="session")
 def trained(shared: Path, tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
-    """The run directory of a two-epoch run, made once by the installed script; each process has a copy of its own."""
-    with FileLock(shared / "trained.lock"):
+    """The run directory of a two-epoch run, made once for all processes; each has a copy of its own."""
+    with FileLock(shared / "trained.lock"), pytest.MonkeyPatch.context() as patch:
+        _restore_logging(patch)  # the fixture of each test comes later
         if not (shared / "trained").is_dir():
             folder = tmp_path_factory.mktemp("trained")
-            done = subprocess.run(**script("train", *TINY, "name=tiny", cwd=folder, cache=cache), check=False)
-            assert done.returncode == 0, done.stdout
+            patch.chdir(folder)
+            patch.setenv("HUDEPTH_CACHE", str(cache))
+            assert _run_script("train", *TINY, "name=tiny") == 0
             folder.rename(shared / "trained")
     copy = tmp_path_factory.mktemp("copy")
     shutil.copytree(shared / "trained" / "runs", copy / "runs")

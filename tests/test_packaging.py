@@ -40,6 +40,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_module_and_configuration(site: Path) -> None:
     for folder, inside in ((ROOT / "hudepth", "hudepth"), (ROOT / "conf", "hudepth/conf")):
         for path in folder.rglob("*"):

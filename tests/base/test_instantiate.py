@@ -98,6 +98,7 @@ def test_misspelt_class() -> None:
     )
 
 
+@pytest.mark.slow
 def test_every_function_and_module_of_hudepth_is_refused() -> None:
     """Whatever a module of hudepth imports, it is no way to anything but classes of the trusted modules."""
     import hudepth.training.callbacks

@@ -31,6 +31,7 @@ def spec(net: nn.Module, tmp_path_factory: pytest.TempPathFactory) -> Spec:
     return Spec("any", "", images_file(folder, (64, 64)), 1, options)
 
 
+@pytest.mark.slow
 def test_all_forms_give_what_the_network_gives(spec: Spec, net: nn.Module) -> None:
     images = np.load(spec.images)
     assert images.shape == (COUNT, 3, 64, 64)

@@ -37,6 +37,7 @@ def composed(*overrides: str, task: str = "train") -> dict[str, object]:
     return {str(key): value for key, value in config.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "group",
     ["data", "model", "augment", "loss", "distill", "optim", "schedule", "trainer", "callbacks", "logger", "protocol"],

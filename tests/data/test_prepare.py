@@ -442,6 +442,7 @@ def readers(tmp_path: Path) -> dict[int, list[str]]:
     return {int(path.name.removeprefix("read_by_")): path.read_text().split() for path in tmp_path.glob("read_by_*")}
 
 
+@pytest.mark.slow
 def test_two_processes_prepare_once(tmp_path: Path, root: Path, cache: Path) -> None:
     write_set(root, 20)
     both = [start(tmp_path, pause=0.03) for _ in range(2)]

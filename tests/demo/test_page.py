@@ -14,21 +14,24 @@ from hudepth.inference.model_info import ModelInfo
 
 from .conftest import encoded
 
-gr = pytest.importorskip("gradio", reason="gradio is not installed")
-REQUEST: Any = gr.Request(session_hash="one")
+
+@pytest.fixture
+def visitor() -> Any:
+    """Who asks; Gradio takes seconds to import, so only these tests do."""
+    return pytest.importorskip("gradio", reason="gradio is not installed").Request(session_hash="one")
 
 
 def buttons(update: tuple[Any, ...]) -> list[tuple[Any, bool]]:
     return [(each["value"], each["interactive"]) for each in update[1:]]
 
 
-def test_the_depth_comes_before_the_files(model: DepthModel) -> None:
+def test_the_depth_comes_before_the_files(model: DepthModel, visitor: Any) -> None:
     from hudepth.demo.page import handler
 
     with Files() as files:
         path = files.uploads / "a.png"
         path.write_bytes(encoded(60, 80))
-        steps = handler(lambda upload: answer(upload, model, Limits(2**20, 10**6)), files)(str(path), REQUEST)
+        steps = handler(lambda upload: answer(upload, model, Limits(2**20, 10**6)), files)(str(path), visitor)
         first = next(steps)
         assert json.loads(json.dumps(first[0]))["width"] == 80
         assert buttons(first) == [(None, False)] * 3
@@ -36,7 +39,7 @@ def test_the_depth_comes_before_the_files(model: DepthModel) -> None:
         second = next(steps)
         assert [Path(value).suffix for value, there in buttons(second) if there] == [".png", ".npy", ".ply"]
         assert next(steps, None) is None
-        (emptied,) = handler(lambda _: None, files)(None, REQUEST)  # type: ignore[arg-type,return-value]
+        (emptied,) = handler(lambda _: None, files)(None, visitor)  # type: ignore[arg-type,return-value]
         assert emptied[0] is None
         assert [p for p in files.root.rglob("*") if p.is_file()] == []
 
@@ -44,19 +47,19 @@ def test_the_depth_comes_before_the_files(model: DepthModel) -> None:
 @pytest.mark.parametrize(
     ("error", "shown"), [(DataError("'<b>': no"), "'<b>': no"), (MemoryError(), "This machine has too little memory")]
 )
-def test_what_goes_wrong_is_for_the_page(error: Exception, shown: str) -> None:
+def test_what_goes_wrong_is_for_the_page(error: Exception, shown: str, visitor: Any) -> None:
     from hudepth.demo.page import handler
 
     def fails(_: Path) -> Answer:
         raise error
 
     with Files() as files:
-        (step,) = handler(fails, files)(str(files.uploads / "a.png"), REQUEST)
+        (step,) = handler(fails, files)(str(files.uploads / "a.png"), visitor)
     assert step[0]["error"].startswith(shown)
     assert buttons(step) == [(None, False)] * 3
 
 
-def test_a_full_disk_costs_the_files_alone(model: DepthModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_costs_the_files_alone(model: DepthModel, monkeypatch: pytest.MonkeyPatch, visitor: Any) -> None:
     from hudepth.demo.page import handler
 
     def full(*_: object) -> None:
@@ -66,7 +69,7 @@ def test_a_full_disk_costs_the_files_alone(model: DepthModel, monkeypatch: pytes
         path = files.uploads / "a.png"
         path.write_bytes(encoded(60, 80))
         monkeypatch.setattr(files, "write", full)
-        (step,) = handler(lambda upload: answer(upload, model, Limits(2**20, 10**6)), files)(str(path), REQUEST)
+        (step,) = handler(lambda upload: answer(upload, model, Limits(2**20, 10**6)), files)(str(path), visitor)
     assert step[0]["height"] == 60
 
 

@@ -24,6 +24,7 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
 EXACT = ("model.onnx", "model.pt2", "model.xml", "tiny")
 
 
+@pytest.mark.slow
 def test_onnx_predicts_what_the_checkpoint_does(command: Command, tiny: Path, tmp_path: Path) -> None:
     """The one export that every test run makes; all other formats are below."""
     Image.fromarray(IMAGE).save(tmp_path / "photo.png")

@@ -171,6 +171,7 @@ def test_one_scene_shows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "654 test images without scenes of nyu_labeled" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_metrics_that_only_new_results_have_are_left_out(tmp_path: Path) -> None:
     run = save(tmp_path / "new", lambda t: replace(t, values={**t.values, "edge_f1_0.25": t.values["ssim"]}))
     assert "edge_f1_0.25" not in run_compare(tmp_path / "out", STUDY, run)["metrics"]

@@ -73,6 +73,7 @@ def test_a_long_id_keeps_its_end() -> None:
     assert label.endswith("long/frame_0042")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 12])
 def test_nothing_is_cut_off_and_the_plots_do_not_overlap(count: int) -> None:
     rng = np.random.default_rng(0)

@@ -151,6 +151,7 @@ def test_a_trial_that_fails_is_told_and_the_search_goes_on(command: Command, tmp
     assert f"{states_.count(TrialState.FAIL)} failed; in " in done.err
 
 
+@pytest.mark.slow
 def test_mistakes_in_a_search_give_one_line(command: Command, tmp_path: Path) -> None:
     trials = "hydra.sweeper.search.trials=1"
     cases = {

@@ -67,6 +67,7 @@ def test_only_what_is_new_runs(command: Command, tmp_path: Path) -> None:
     assert "1 of 2 jobs to run, 1 already finished" in seeds.err  # 42 is the default, typed or not
 
 
+@pytest.mark.slow
 def test_lines_tell_what_each_job_does(command: Command, tmp_path: Path) -> None:
     done = sweep(command, "loss=l1,l2", "trainer.max_epochs=2")
     lines = done.err.splitlines()
@@ -104,6 +105,7 @@ def test_a_failing_job_stops_no_other_and_is_tried_again(command: Command, tmp_p
     assert "optim.lr=-1,1e-3 sweep_dir=s" in again.err
 
 
+@pytest.mark.slow
 def test_a_job_that_is_refused_before_it_starts_leaves_a_status_too(command: Command, tmp_path: Path) -> None:
     assert sweep(command, "callbacks.panels_every_n_epochs=1", "mode=min,mean").code == 1
     run = runs(tmp_path / "s")["mean"]
@@ -199,6 +201,7 @@ def test_variants_are_picked_and_seeds_change_last(command: Command, tmp_path: P
     assert "1 of 1 jobs to run" in one.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "key", "word"),
     [

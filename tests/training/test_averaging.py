@@ -186,6 +186,7 @@ def test_the_average_validates_and_is_kept_and_training_does_not_notice(cache: P
     assert equal(dict(module.state_dict()), watch.validated[-1])  # what is left in memory
 
 
+@pytest.mark.slow
 def test_best_holds_the_average_alone_and_last_the_weights_beside_it(cache: Path, tmp_path: Path) -> None:
     watch = Watch()
     fit(cache, tmp_path, [EMA(decay=0.7), watch])

@@ -153,6 +153,7 @@ def test_resume_refuses_what_it_cannot_do(command: Command, trained: Path, tmp_p
     assert "resume: 'loss=l1' cannot be changed when a run is resumed" in done.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_resume_adds_epochs_to_a_finished_run(command: Command, tmp_path: Path) -> None:
     """Two epochs and one more are bit for bit three epochs."""
     options = (*TINY, "test=false", "callbacks.panels=0", "logger=none")

@@ -151,6 +151,7 @@ def test_a_share_that_is_none(until: float) -> None:
     assert str(caught.value).startswith(f"FreezeEncoder.until: {until} ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stages", [[], ["layer1"], ["stem", "layer2"], ["layer1", "stem"], [*STAGES, "layer4"], ["conv1"]]
 )

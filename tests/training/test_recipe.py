@@ -35,6 +35,7 @@ def last_line(text: str) -> str:
     return text.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_progressive_resolution_is_in_times_csv_and_only_its_last_part_can_be_best(
     command: Command, tmp_path: Path
 ) -> None:
@@ -104,6 +105,7 @@ def test_a_rate_that_diverges_stops_with_the_step_and_where_to_go_on(command: Co
     assert "lower optim.lr" in line
 
 
+@pytest.mark.slow
 def test_augmentation_that_leaves_nothing_stops_with_the_pairs(
     command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -318,6 +320,7 @@ def teacher(command: Command, tmp_path: Path, cache: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_teacher_that_is_the_truth_is_as_far_away_as_the_truth(
     teacher: Path, command: Command, tmp_path: Path
 ) -> None:
@@ -336,6 +339,7 @@ def test_a_teacher_that_is_the_truth_is_as_far_away_as_the_truth(
         assert "val/loss/distill" not in row
 
 
+@pytest.mark.slow
 def test_a_teacher_that_lacks_depths_is_refused(teacher: Path, command: Command) -> None:
     for file in teacher.rglob("*.npy"):
         file.unlink()

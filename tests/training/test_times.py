@@ -93,6 +93,7 @@ def test_a_row_an_epoch(cache: Path, tmp_path: Path) -> None:
     assert [rate / rates[0] for rate in rates] == pytest.approx([1, 0.5, 0.25, 0.125])
 
 
+@pytest.mark.slow
 def test_a_resumed_run_adds_to_the_rows_of_the_epochs_that_are_done(cache: Path, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="killed"):
         fit(cache, tmp_path, [StopAt(3)])

@@ -64,6 +64,7 @@ def test_a_rare_bin_is_pale_and_does_not_set_the_scale() -> None:
     assert [text.get_text().strip() for text in axis.texts] == ["5.000", "0.100"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("categories", [0, 1, 9, 12])
 def test_nothing_is_cut_off_and_nothing_overlaps(categories: int) -> None:
     figure = draw_strata(make_rows(categories), title="eigen protocol, 654 test images of nyu_labeled")

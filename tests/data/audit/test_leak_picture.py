@@ -61,6 +61,7 @@ def test_a_long_name_keeps_its_end() -> None:
     assert name.endswith("/living_room_0029/123")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(24, 32), (32, 24), (32, 32)])
 @pytest.mark.parametrize("rows", [1, 6])
 def test_nothing_is_cut_off_and_nothing_overlaps(rows: int, shape: tuple[int, int]) -> None:

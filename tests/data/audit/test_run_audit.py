@@ -87,6 +87,7 @@ def test_copies_are_found_and_shown(command: Command, tmp_path: Path) -> None:
     assert picture.shape[0] > picture.shape[1]
 
 
+@pytest.mark.slow
 def test_images_that_differ_are_no_leak(command: Command, tmp_path: Path) -> None:
     write_list(tmp_path / "nyu")
     write_frames(tmp_path / "nyu", copies=False)
@@ -97,6 +98,7 @@ def test_images_that_differ_are_no_leak(command: Command, tmp_path: Path) -> Non
     assert not any(leak["near"] for leak in found["leaks"])
 
 
+@pytest.mark.slow
 def test_images_can_be_left_out_and_asked_for(command: Command, tmp_path: Path) -> None:
     write_list(tmp_path / "nyu")
     done = command(*ARGUMENTS, "images=true")
@@ -111,6 +113,7 @@ def test_images_can_be_left_out_and_asked_for(command: Command, tmp_path: Path) 
     assert "images: 'yes_please' is not one of auto, true, false" in done.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_large_sets_are_read_only_once_prepared(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,6 +127,7 @@ def test_large_sets_are_read_only_once_prepared(
     assert report(tmp_path / "audit_densedepth")["images"]
 
 
+@pytest.mark.slow
 def test_bad_files_are_findings_and_the_rest_is_looked_at(command: Command, tmp_path: Path) -> None:
     write_list(tmp_path / "nyu")
     write_frames(tmp_path / "nyu", copies=False)
@@ -168,6 +172,7 @@ def test_an_output_that_cannot_be_written(command: Command, tmp_path: Path) -> N
     assert "output: cannot write to 'taken/below'" in done.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_rooms_are_audited_without_files(command: Command, tmp_path: Path) -> None:
     done = command("data", "audit", *ROOMS)
     assert done.code == 0, done.err

@@ -18,16 +18,19 @@ def scores(rooms: Rooms) -> list[Score]:
     return score_readings(rooms, predictions(rooms))
 
 
+@pytest.mark.slow
 def test_split_counts_hold() -> None:
     row = rows_data.split_row()
     assert (row.verdict, row.values) == ("holds", {"train": 35_481, "val": 5_068, "test": 10_139})
 
 
+@pytest.mark.slow
 def test_split_counts_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiments.ledger.tables.SPLIT_COUNTS", (35_482, 5_068, 10_138))
     assert rows_data.split_row().verdict == "contradicted"
 
 
+@pytest.mark.slow
 def test_leakage() -> None:
     row = rows_data.leakage_row()
     assert row.verdict == "contradicted"
