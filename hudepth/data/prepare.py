@@ -22,6 +22,7 @@ from hudepth.base.options import convert
 from hudepth.data.encoding import check_range
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres
 from hudepth.data.sources.base import Record, Source
+from hudepth.data.sources.contents import hash_contents
 from hudepth.data.store import VERSION, DepthStore, StoreWriter
 
 MAX_SIZES = 16
@@ -34,12 +35,12 @@ _NONE = np.empty(0, np.uint8)
 
 
 def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Path) -> Path:
-    """Return the path of the store of this source and size: equal inputs give equal names, changed files new ones.
+    """Return the path of the store of this source and size: equal inputs give equal names, changed contents new ones.
 
-    Raises DataError if the source's root or index cannot be read.
+    Raises DataError if the source's root, its index or a file cannot be read.
     """
-    times = [file.stat().st_mtime_ns for file in source.files() if file.exists()]
-    key = [VERSION, source.name, source.fingerprint(), times, size, source.encoding, native]
+    contents = hash_contents(source, cache=cache)
+    key = [VERSION, source.name, source.fingerprint(), contents, size, source.encoding, native]
     return cache / f"{source.name}-{size[0]}x{size[1]}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
 
 

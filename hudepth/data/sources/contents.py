@@ -1,0 +1,68 @@
+"""A hash over what the files of a source hold: sets of equal names, sizes and times are still told apart."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from hudepth.base.errors import DataError
+from hudepth.base.files import write_text
+from hudepth.data.sources.base import Source
+
+_THREADS = 8
+_SETTLED_NS = 2 * 10**9
+"""A file changed more recently is read again next time: a further change could leave its stat as it is."""
+
+
+def hash_contents(source: Source, *, cache: Path) -> str:
+    """Return a hash over the contents of all files of ``source``, in order; missing files count as such.
+
+    A file is read only if its size, times or inode differ from what a JSON file in ``cache`` remembers. Raises
+    DataError if a file cannot be read.
+    """
+    files = source.files()
+    if not files:
+        return ""
+    folder = os.path.commonpath([file.absolute().parent for file in files])
+    memo = cache / f"contents-{source.name}-{hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]}.json"
+    known = _read(memo)
+    now = time.time_ns()
+    with ThreadPoolExecutor(_THREADS) as pool:  # hashing and reading release the interpreter's lock
+        found = list(pool.map(lambda file: _state(file, known), files))
+    digests = [digest for _, digest in found]
+    entries = {str(file): [*stat, digest] for file, (stat, digest) in zip(files, found, strict=True) if stat}
+    entries = {name: entry for name, entry in entries.items() if max(entry[1], entry[2]) < now - _SETTLED_NS}
+    if entries != known:
+        with suppress(OSError):  # a cache that can only be read, or is full: they are read again next time
+            write_text(memo, json.dumps(entries))
+    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
+
+
+def _read(memo: Path) -> dict[str, list[int | str]]:
+    try:
+        known = json.loads(memo.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def _state(file: Path, known: dict[str, list[int | str]]) -> tuple[Sequence[int], str]:
+    """Return size, times and inode of a file, and the digest of its contents; ``()`` and a word if it is missing."""
+    try:
+        stat = file.stat()
+        state = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
+        entry = known.get(str(file))
+        if isinstance(entry, list) and len(entry) == 5 and entry[:4] == state and isinstance(entry[4], str):
+            return state, entry[4]
+        with file.open("rb") as stream:
+            return state, hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    except (FileNotFoundError, NotADirectoryError):
+        return (), "missing"
+    except OSError as error:
+        raise DataError(f"'{file}': cannot be read ({error.strerror or error}). Make it readable.") from error
