@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from hudepth.base.errors import DataError
 from hudepth.base.files import write_text
@@ -36,7 +37,9 @@ def hash_contents(source: Source, *, cache: Path) -> str:
     with ThreadPoolExecutor(_THREADS) as pool:  # hashing and reading release the interpreter's lock
         found = list(pool.map(lambda file: _state(file, known), files))
     digests = [digest for _, digest in found]
-    entries = {str(file): [*stat, digest] for file, (stat, digest) in zip(files, found, strict=True) if stat}
+    entries: dict[str, Any] = {
+        str(file): [*stat, digest] for file, (stat, digest) in zip(files, found, strict=True) if stat
+    }
     entries = {name: entry for name, entry in entries.items() if max(entry[1], entry[2]) < now - _SETTLED_NS}
     if entries != known:
         with suppress(OSError):  # a cache that can only be read, or is full: they are read again next time
@@ -44,7 +47,7 @@ def hash_contents(source: Source, *, cache: Path) -> str:
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def _read(memo: Path) -> dict[str, list[int | str]]:
+def _read(memo: Path) -> dict[str, Any]:
     try:
         known = json.loads(memo.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -52,7 +55,7 @@ def _read(memo: Path) -> dict[str, list[int | str]]:
     return known if isinstance(known, dict) else {}
 
 
-def _state(file: Path, known: dict[str, list[int | str]]) -> tuple[Sequence[int], str]:
+def _state(file: Path, known: dict[str, Any]) -> tuple[Sequence[int], str]:
     """Return size, times and inode of a file, and the digest of its contents; ``()`` and a word if it is missing."""
     try:
         stat = file.stat()
