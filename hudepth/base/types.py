@@ -17,7 +17,8 @@ class RawBatch(TypedDict):
     image: UInt8[Tensor, "b h w 3"]
     """RGB."""
     depth_mm: UInt16[Tensor, "b h w"]
-    """Millimetres, 0 where unmeasured."""
+    """Depth as the store holds it, 0 where unmeasured: ``per_m`` to the metre, or millimetres."""
+    per_m: NotRequired[int]
     index: Int[Tensor, " b"]
     """Position in the depth store."""
     native_depth: NotRequired[list[Float[Tensor, "1 H W"]]]

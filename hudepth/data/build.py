@@ -11,7 +11,8 @@ from hudepth.data.augment import Augmentation
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.sources.base import Source
 
-_SOURCE_KEYS = ("root", "encoding")  # of the source, but next to it in the configuration: they are often overridden
+# Of the source, but next to it in the configuration: they are often overridden.
+_SOURCE_KEYS = ("root", "encoding", "depth_scale_m", "invalid")
 
 
 def build_data(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,11 +15,12 @@ from lightning.pytorch.trainer.states import TrainerFn
 from torch.nn import functional
 from torch.utils.data import DataLoader, DistributedSampler
 
+from hudepth.base.console import log
 from hudepth.base.options import Range, Size, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
 from hudepth.data.dataset import BlockShuffle, ShardSampler, StoreDataset, as_is
-from hudepth.data.prepare import OnError, prepare
+from hudepth.data.prepare import OnError, prepare, share_beyond
 from hudepth.data.preprocess import preprocess
 from hudepth.data.resolution import read_stages, size_at
 from hudepth.data.sources.base import Source
@@ -106,8 +108,14 @@ class DepthDataModule(LightningDataModule):
         return None if folder is None else TeacherDepths(folder, self.store, self.split.train)
 
     def prepare_data(self) -> None:
-        """Build the depth store and read the teacher's depths."""
+        """Build the depth store and read the teacher's depths; warn if most depths are clipped."""
         _ = self.store, self.teacher
+        beyond = share_beyond(self.store, self.max_depth_m)
+        if beyond > 0.01:
+            level = logging.WARNING if beyond > 0.5 else logging.INFO
+            text = "%.0f %% of measured pixels are beyond data.max_depth_m=%g and count as that%s"
+            fix = f". Pass a larger data.max_depth_m: depths reach {self.store.info['depth_max_m']:g} m"
+            log.log(level, text, 100 * beyond, self.max_depth_m, fix if beyond > 0.5 else "")
 
     def train_dataloader(self) -> DataLoader[RawBatch]:
         """Shuffled training batches; the last, shorter one is kept."""

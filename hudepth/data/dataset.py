@@ -38,6 +38,7 @@ class StoreDataset(Dataset[RawBatch]):
         rows = [self.indices[position] for position in positions]
         image, depth_mm = self.store.read(rows)
         batch = RawBatch(image=torch.from_numpy(image), depth_mm=torch.from_numpy(depth_mm), index=torch.tensor(rows))
+        batch["per_m"] = self.store.per_m
         if self.native:
             batch["native_depth"] = [torch.from_numpy(self.store.read_native(row))[None] for row in rows]
         if self.teacher is not None:

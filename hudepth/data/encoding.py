@@ -14,14 +14,22 @@ from numpy.typing import NDArray
 from hudepth.base.errors import DataError
 from hudepth.base.options import Choice, convert
 
-ENCODINGS = ("auto", "uint16_mm", "uint8_10m", "float_m", "linear", "paper_literal")
+PER_M = {
+    "uint16_mm": 1000, "uint16_256": 256, "uint16_4000": 4000, "uint16_5000": 5000, "uint16_10000": 10_000,
+    "mm": 1000, "cm": 100, "float_m": 1, "paper_literal": 1000,
+}  # fmt: skip
+"""Encodings that only state how many stored values make a metre."""
+ENCODINGS = ("auto", *PER_M, "uint8_10m", "sunrgbd", "linear", "disparity")
 """Values of ``data.encoding``; :func:`to_metres` explains them."""
 Encoding = Annotated[str, Choice(ENCODINGS)]
 """One of :data:`ENCODINGS`, as the type of an option."""
 
 INDOOR_MEDIAN_M = (0.3, 20.0)
 """Median depths [m] an indoor set can have; a wrong unit lands far outside."""
+FAR_INDOORS_M = 8.0
+"""An indoor set with a median beyond it [m] gets a warning."""
 
+_AUTO_MAX_M = 15.0  # sensors that store 16-bit millimetres see no farther; KITTI read so reaches 20 m
 _FULL_SCALE_8BIT_M = 10.0  # DenseDepth's training PNGs: 255 is 10 m
 _ADVICE_8BIT = (
     "Use data.encoding=uint8_10m for value/255*10 m, or data.encoding=paper_literal to read it so on purpose."
@@ -65,7 +73,7 @@ def resolve_encoding(
 
 def to_metres(
     raw: NDArray[np.generic], encoding: str, *, scale_m: float | None = None, offset: float = 0.0,
-    auto_uint8: str | None = None, where: str = "",
+    auto_uint8: str | None = None, invalid: Sequence[float] | None = None, where: str = "",
 ) -> NDArray[np.float32]:  # fmt: skip
     """Convert stored depth values to float32 metres [H, W], 0 where unmeasured.
 
@@ -73,18 +81,27 @@ def to_metres(
     encoding       stored values                  depth [m]
     ============== ============================== =========================================
     uint16_mm      integers of 16 bits or more    value / 1000
-    uint8_10m      uint8                          value / 255 * 10 (DenseDepth's training PNGs)
+    uint16_256     likewise                       value / 256 (KITTI)
+    uint16_4000    likewise                       value / 4000 (Matterport3D)
+    uint16_5000    likewise                       value / 5000 (TUM RGB-D)
+    uint16_10000   likewise                       value / 10000
+    sunrgbd        uint16                         (value >> 3 | value << 13) / 1000 (SUN RGB-D)
+    mm, cm         any number                     value / 1000, value / 100
     float_m        floating point                 value
+    uint8_10m      uint8                          value / 255 * 10 (DenseDepth's training PNGs)
     linear         any number                     (value + offset) * scale_m
+    disparity      any number                     scale_m / (value + offset)
     paper_literal  any integers                   value / 1000, 8-bit data included
     auto           any of the above               see :func:`resolve_encoding`
     ============== ============================== =========================================
 
-    NaN, infinite, negative and zero depths count as unmeasured. A stored 0 is unmeasured too, except under
-    ``linear``, where 0 is a value like any other.
+    Depths that are NaN, infinite, negative or zero count as unmeasured. So does a stored 0, except under ``linear``,
+    where 0 is a value like any other, and what is in ``invalid``: by default, the largest value of an integer type of
+    16 bits or more.
 
-    ``scale_m`` is in metres per unit of the stored value, ``offset`` in such units; ``where`` names the file in errors.
-    Raises ConfigError if the encoding is unknown; DataError if the values do not fit it, or ``linear`` has no scale.
+    ``scale_m`` is in metres per unit of the stored value, for ``disparity`` focal length [pixels] times baseline [m], 1
+    for inverse depth; ``offset`` is in units of the stored value; ``where`` names the file in errors. Raises
+    ConfigError if the encoding is unknown; DataError if the values do not fit it, or a scale is missing.
     """
     if raw.ndim != 2:
         raise DataError(f"{_prefix(where)}depth has shape {raw.shape}. Store one value per pixel, as [H, W].")
@@ -92,23 +109,45 @@ def to_metres(
     name = resolve_encoding(encoding, dtype=raw.dtype, has_scale=has_scale, auto_uint8=auto_uint8, where=where)
     _check_values(raw, name, where)
     values = raw.astype(np.float64)  # float64: one rounding, at the end
-    if name == "linear":
-        values = (values + offset) * _check_scale(scale_m, offset, where)
-    elif name == "uint8_10m":
-        values = values / 255 * _FULL_SCALE_8BIT_M
-    elif name != "float_m":
-        values = values / 1000
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        if name == "linear":
+            values = (values + offset) * _check_scale(name, scale_m, offset, where)
+        elif name == "disparity":
+            values = _check_scale(name, scale_m, offset, where) / (values + offset)
+        elif name == "uint8_10m":
+            values = values / 255 * _FULL_SCALE_8BIT_M
+        elif name == "sunrgbd":
+            bits = raw.astype(np.uint16)
+            values = (bits >> 3 | bits << 13).astype(np.float64) / 1000
+        else:
+            values = values / PER_M[name]
         metres = values.astype(np.float32)
-        metres[~(np.isfinite(metres) & (metres > 0))] = 0.0
+        metres[~(np.isfinite(metres) & (metres > 0)) | is_invalid(raw, invalid)] = 0.0
     return metres
 
 
-def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str) -> DepthRange:
+def is_invalid(raw: NDArray[np.generic], invalid: Sequence[float] | None) -> NDArray[np.bool_]:
+    """Return where stored values mean "no reading"; None: at the largest of an integer type of 16 bits or more."""
+    if invalid is None:
+        if raw.dtype.kind not in "ui" or raw.dtype.itemsize == 1:
+            return np.zeros(raw.shape, bool)
+        return np.asarray(raw == np.iinfo(raw.dtype.str).max)
+    values = np.asarray(invalid, np.float64)
+    if raw.dtype.kind == "f":
+        values = values.astype(raw.dtype).astype(np.float64)  # as the files round it
+    return np.isin(raw.astype(np.float64), values)
+
+
+def check_range(
+    depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str,
+    raws: Sequence[NDArray[np.generic]] = (),
+) -> DepthRange:  # fmt: skip
     """Measure the range of a sample of depths [H, W] in metres, 0 where unmeasured.
 
-    Raises DataError if nothing is measured, or an indoor set's median is outside :data:`INDOOR_MEDIAN_M`, except under
-    ``paper_literal``, which is implausible on purpose. ``name`` is the set's, for errors.
+    Raises DataError if nothing is measured, if an indoor set's median is outside :data:`INDOOR_MEDIAN_M`, except under
+    ``paper_literal``, which is implausible on purpose, or if ``auto`` would take values for millimetres that need not
+    be any. ``name`` is the set's, for errors; they name encodings that would make ``raws``, the same depths as
+    stored, plausible for a room.
     """
     others = ", ".join(other for other in ENCODINGS if other not in (encoding, "auto"))
     measured = np.concatenate([depth[depth > 0] for depth in depths] or [np.zeros(0, np.float32)])
@@ -119,37 +158,76 @@ def check_range(depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding
         )
     share = measured.size / sum(depth.size for depth in depths)
     found = DepthRange(float(measured.min()), float(np.median(measured)), float(measured.max()), share)
+    as_mm = encoding == "auto" and any(raw.dtype.kind == "u" and raw.dtype.itemsize == 2 for raw in raws)
+    if as_mm and (not indoor or found.max_m > _AUTO_MAX_M):
+        raise DataError(
+            f"data.encoding=auto: '{name}' holds 16-bit depth up to {found.max_m:.3g} m if it is millimetres, but "
+            "it may be KITTI's 1/256 m or another unit. Pass data.encoding=uint16_256, uint16_mm, or another unit."
+        )
     low, high = INDOOR_MEDIAN_M
     if indoor and encoding != "paper_literal" and not low <= found.median_m <= high:
         raise DataError(
             f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, "
-            f"indoor sets lie in {low:g} to {high:g} m. "
-            f"Pass another data.encoding ({others}), or data.source.indoor=false for outdoor pairs."
+            f"indoor sets lie in {low:g} to {high:g} m. Pass "
+            f"{suggest(raws) or f'another data.encoding ({others})'}, or data.source.indoor=false for outdoor pairs."
         )
     return found
+
+
+def suggest(raws: Sequence[NDArray[np.generic]]) -> str:
+    """Return the encodings that give stored depths a median typical of rooms, each with it; empty if none does."""
+    found: list[str] = []
+    for name in ENCODINGS[1:]:
+        if name in ("paper_literal", "linear", "disparity"):  # wrong on purpose, or in need of a scale
+            continue
+        # The lowest bits of SUN RGB-D are the highest of the depth, which rooms leave empty.
+        if name == "sunrgbd" and not all(map(_looks_rotated, raws)):
+            continue
+        try:
+            depths = [depth[depth > 0] for depth in (to_metres(raw, name) for raw in raws)]
+        except DataError:
+            continue
+        median = float(np.median(np.concatenate(depths))) if any(map(len, depths)) else 0.0
+        if 0.5 <= median <= FAR_INDOORS_M and not (name == "mm" and any("uint16_mm" in text for text in found)):
+            found.append(f"data.encoding={name} (median {median:.2g} m)")
+    return " or ".join(found)
+
+
+def _looks_rotated(raw: NDArray[np.generic]) -> bool:
+    return raw.dtype == np.uint16 and bool(np.mean(raw.astype(np.uint16) & 7 == 0) > 0.9)
+
+
+def looks_swapped(raw: NDArray[np.generic]) -> bool:
+    """Return whether 16-bit values [H, W] are noise as they are, but a smooth surface with their bytes swapped."""
+    if raw.dtype not in (np.uint16, np.int16) or raw.shape[1] < 2:
+        return False
+    given, swapped = (np.abs(np.diff(values.astype(np.float64))).mean() for values in (raw, raw.byteswap()))
+    return bool(given > 0.1 * np.ptp(raw.astype(np.float64)) and swapped < given / 8)
 
 
 def _check_values(raw: NDArray[np.generic], name: str, where: str) -> None:
     integer, bits = raw.dtype.kind in "ui", raw.dtype.itemsize * 8
     if raw.dtype.kind not in "uif":
         raise DataError(f"{_prefix(where)}depth values of type {raw.dtype} are not numbers. Store integers or floats.")
-    if name == "uint16_mm" and integer and bits == 8:
+    if name in ("uint16_mm", "mm") and integer and bits == 8:
         largest = int(raw.max(initial=0))
         raise DataError(
             f"{_prefix(where)}8-bit data declared as millimetres "
             f"(largest value {largest} = {largest / 1000:g} m). {_ADVICE_8BIT}"
         )
-    fits = {"uint8_10m": raw.dtype == np.uint8, "float_m": not integer, "linear": True}
-    if not fits.get(name, integer):
-        likely = "float_m" if not integer else "uint8_10m" if raw.dtype == np.uint8 else "uint16_mm"
+    any_number = dict.fromkeys(("linear", "disparity", "mm", "cm"), True)
+    fits = {"uint8_10m": raw.dtype == np.uint8, "sunrgbd": raw.dtype == np.uint16, "float_m": not integer, **any_number}
+    if not fits.get(name, integer and (bits > 8 or name == "paper_literal")):
+        likely = "float_m, mm or cm" if not integer else "uint8_10m" if raw.dtype == np.uint8 else "uint16_mm"
         raise DataError(f"{_prefix(where)}{raw.dtype} data declared as {name}. Use data.encoding={likely}.")
 
 
-def _check_scale(scale_m: float | None, offset: float, where: str) -> float:
+def _check_scale(name: str, scale_m: float | None, offset: float, where: str) -> float:
     if scale_m is None:
+        unit = "metres per stored unit" if name == "linear" else "focal length [pixels] * baseline [m], or 1"
         raise DataError(
-            f"{_prefix(where)}data.encoding=linear needs a scale for each image, and there is none. "
-            "Add the column depth_scale_m to the index, or pass another data.encoding."
+            f"{_prefix(where)}data.encoding={name} needs a scale, and there is none. Pass data.depth_scale_m=<{unit}>, "
+            "add the column depth_scale_m to the index, or pass another data.encoding."
         )
     if not (np.isfinite(scale_m) and scale_m > 0 and np.isfinite(offset)):
         raise DataError(

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from hudepth.base.errors import DataError
 from hudepth.base.images import resize_image
 from hudepth.base.machine import usable_cores
-from hudepth.data.encoding import to_metres
+from hudepth.data.encoding import is_invalid, to_metres
 from hudepth.data.sources.base import Record, Source
-from hudepth.data.store import to_mm
+from hudepth.data.store import MAX_STORED, MM_PER_M, OUTDOOR_PER_M, to_stored
 
 POOL_FROM = 32
 """Fewer pairs than this are prepared in this process: starting others would take longer."""
@@ -33,14 +33,17 @@ POOL_FROM = 32
 
 @dataclass(frozen=True, slots=True)
 class PreparedPair:
-    """One pair, ready for the store; ``range_m`` is its smallest, median and largest measured depth."""
+    """One pair, ready for the store, which holds its depth times :func:`values_per_metre`."""
 
     image: NDArray[np.uint8]
     depth_mm: NDArray[np.uint16]
     native_png: NDArray[np.uint8] | None
     native_size: tuple[int, int]
     range_m: tuple[float, float, float]
+    """Smallest, median and largest measured depth."""
     valid_fraction: float
+    no_reading: float
+    """Share of pixels that hold the largest value of their type, taken as unmeasured because nothing else was said."""
 
 
 def read_metres(source: Source, record: Record, raw: NDArray[np.generic]) -> NDArray[np.float32]:
@@ -48,31 +51,64 @@ def read_metres(source: Source, record: Record, raw: NDArray[np.generic]) -> NDA
     return to_metres(
         raw,
         source.encoding,
-        scale_m=record.depth_scale_m,
+        scale_m=source.depth_scale_m if record.depth_scale_m is None else record.depth_scale_m,
         offset=record.depth_offset,
         auto_uint8=source.auto_uint8,
+        invalid=source.invalid,
         where=record.depth or record.id,
     )
 
 
+def values_per_metre(source: Source) -> int:
+    """Return how finely a store holds a source's depth: in millimetres, or if it is not indoors in 1/256 m."""
+    return MM_PER_M if source.indoor else OUTDOOR_PER_M
+
+
 def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair:
-    """Decode, check and resize one pair; DataError if it cannot be read or holds no measured depth."""
+    """Decode, check and resize one pair; DataError if it cannot be read, or its depth is unmeasured or too far."""
     raw = source.read(record)
     depth_m = read_metres(source, record, raw.depth)
     measured = depth_m[depth_m > 0]
     if not measured.size:
-        raise DataError(f"'{record.depth or record.id}': the depth is zero everywhere, nothing is measured.")
+        raise DataError(f"'{record.depth or record.id}': {unmeasured(raw.depth)}")
+    per_m = values_per_metre(source)
+    if float(measured.max()) > MAX_STORED / per_m:
+        raise DataError(f"'{record.depth or record.id}': {_too_far(float(measured.max()), source)}")
     height, width = size
     image = resize_image(raw.image, size)
     depth = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    png = cv2.imencode(".png", to_mm(depth_m), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel() if native else None
+    png = None
+    if native:
+        png = cv2.imencode(".png", to_stored(depth_m, per_m), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
     return PreparedPair(
         image=image,
-        depth_mm=to_mm(depth.astype(np.float32, copy=False)),
+        depth_mm=to_stored(depth.astype(np.float32, copy=False), per_m),
         native_png=None if png is None else png.astype(np.uint8, copy=False),
         native_size=(depth_m.shape[0], depth_m.shape[1]),
         range_m=(float(measured.min()), float(np.median(measured)), float(measured.max())),
         valid_fraction=measured.size / depth_m.size,
+        no_reading=0.0 if source.invalid is not None else float(is_invalid(raw.depth, None).mean()),
+    )
+
+
+def unmeasured(raw: NDArray[np.generic]) -> str:
+    """Say why no value of a depth map is a depth."""
+    numbers = raw[np.isfinite(raw)] if raw.dtype.kind == "f" else raw.ravel()
+    if not numbers.size:
+        return "nothing is measured, no value is a finite number."
+    low, high = numbers.min(), numbers.max()
+    if low == high == 0:
+        return "the depth is zero everywhere, nothing is measured."
+    held = f"nothing is measured, its {raw.dtype} values lie in {low:g} to {high:g}"
+    return f"{held}. {'Check data.encoding and data.invalid.' if high > 0 else 'Store depths without their sign.'}"
+
+
+def _too_far(largest_m: float, source: Source) -> str:
+    most = MAX_STORED / values_per_metre(source)
+    fix = "data.source.indoor=false for up to 255.996 m, " if source.indoor else ""
+    return (
+        f"its largest depth, {largest_m:.6g} m, is beyond the {most:.6g} m that a store holds. Pass {fix}another "
+        "data.encoding if the unit is wrong, or data.invalid=[<value>] if it stands for no reading."
     )
 
 

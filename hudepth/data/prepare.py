@@ -14,16 +14,17 @@ from typing import Any, Literal
 
 import numpy as np
 from filelock import FileLock
+from numpy.typing import NDArray
 
 from hudepth.base.console import log, track
 from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
 from hudepth.base.options import convert
-from hudepth.data.encoding import check_range
-from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres
+from hudepth.data.encoding import FAR_INDOORS_M, check_range, looks_swapped, suggest
+from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres, values_per_metre
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.sources.contents import hash_contents
-from hudepth.data.store import VERSION, DepthStore, StoreWriter
+from hudepth.data.store import MAX_STORED, VERSION, DepthStore, StoreWriter
 
 MAX_SIZES = 16
 """Largest number of image sizes that a store lists."""
@@ -40,7 +41,8 @@ def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Pa
     Raises DataError if the source's root, its index or a file cannot be read.
     """
     contents = hash_contents(source, cache=cache)
-    key = [VERSION, source.name, source.fingerprint(), contents, size, source.encoding, native]
+    unit = [source.encoding, values_per_metre(source), source.depth_scale_m, source.invalid]
+    key = [VERSION, source.name, source.fingerprint(), contents, size, unit, native]
     return cache / f"{source.name}-{size[0]}x{size[1]}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
 
 
@@ -106,9 +108,10 @@ def _build(
     if needed > free:  # for images and depths
         raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
     skipped: list[str] = []
+    histogram = np.zeros(MAX_STORED + 1, np.int64)
     pairs: list[PreparedPair] = []  # without their pixels
     with written_whole(path) as part:
-        writer = StoreWriter(part, size=size, native=native)
+        writer = StoreWriter(part, size=size, native=native, per_m=values_per_metre(source))
         try:
             # closing: an error below must end the processes at once, not when its traceback is forgotten
             with closing(prepare_pairs(source, records, size, native=native, workers=workers)) as outcomes:
@@ -119,10 +122,11 @@ def _build(
                         skipped.append(outcome)
                         continue
                     writer.append(record, outcome.image, outcome.depth_mm, outcome.native_png)
+                    histogram += np.bincount(outcome.depth_mm.ravel(), minlength=len(histogram))
                     pairs.append(replace(outcome, image=_NONE, depth_mm=_NONE.astype(np.uint16), native_png=None))
             if not pairs:
                 raise DataError(f"{source.name}: none of {len(records)} pairs could be read; the first: {skipped[0]}")
-            info = _info(source, pairs, skipped)
+            info = _info(source, pairs, skipped, histogram)
             writer.close(info)
         except BaseException:
             writer.abort()
@@ -135,23 +139,45 @@ def _check_units(source: Source, records: Sequence[Record]) -> None:
     if not records:
         raise DataError(f"{source.name}: the set is empty. Check data.root.")
     step = max(1, len(records) // UNIT_SAMPLES)
-    depths, refused = [], []
+    depths, raws, refused = [], [], []
     for record in records[::step][:UNIT_SAMPLES]:
-        raw = None
         try:
             raw = source.read(record).depth
+        except DataError:  # reported later, in its turn
+            continue
+        if looks_swapped(raw):
+            where = record.depth or record.id
+            raise DataError(f"'{where}': 16-bit values with their bytes swapped. Write them in the file's byte order.")
+        try:
             depths.append(read_metres(source, record, raw))
+            raws.append(raw)
         except DataError as error:
-            if raw is not None:  # files that cannot be read are reported later, in their turn
-                refused.append(error)
+            refused.append(error)
     if refused and not depths:  # the wrong encoding, not one bad file
         raise refused[0]
-    if any((depth > 0).any() for depth in depths):
-        check_range(depths, indoor=source.indoor, encoding=source.encoding, name=source.name)
+    if not any((depth > 0).any() for depth in depths):
+        return
+    own_scale = source.depth_scale_m is not None or any(record.depth_scale_m is not None for record in records)
+    shown = [] if own_scale else raws
+    name, encoding = source.name, source.encoding
+    found = check_range(depths, indoor=source.indoor, encoding=encoding, name=name, raws=shown)
+    if source.indoor and found.median_m > FAR_INDOORS_M and encoding != "paper_literal":
+        fix = suggest(shown) or "data.source.indoor=false if it is not indoors"
+        log.warning("%s: a median depth of %.3g m is far for rooms. Meant is perhaps %s", name, found.median_m, fix)
 
 
-def _info(source: Source, pairs: Sequence[PreparedPair], skipped: list[str]) -> dict[str, Any]:
+def share_beyond(store: DepthStore, max_depth_m: float) -> float:
+    """Return the share of measured pixels of a store beyond a depth, to 1 %; 0 if the store does not know."""
+    percentiles = store.info.get("depth_percentiles_m") or [0.0]
+    return float(np.mean(np.asarray(percentiles, np.float64) > max_depth_m))
+
+
+def _info(
+    source: Source, pairs: Sequence[PreparedPair], skipped: list[str], histogram: NDArray[np.int64]
+) -> dict[str, Any]:
     ranges = np.array([pair.range_m for pair in pairs])
+    below = histogram[1:].cumsum()
+    percentiles = np.searchsorted(below, np.maximum(1, np.linspace(0, 1, 101) * below[-1])) + 1
     return {
         "source": source.name,
         "fingerprint": source.fingerprint(),
@@ -160,6 +186,8 @@ def _info(source: Source, pairs: Sequence[PreparedPair], skipped: list[str]) -> 
         "depth_min_m": round(float(ranges[:, 0].min()), 3),
         "depth_median_m": round(float(np.median(ranges[:, 1])), 3),
         "depth_max_m": round(float(ranges[:, 2].max()), 3),
+        "depth_percentiles_m": (percentiles / values_per_metre(source)).round(3).tolist(),
+        "no_reading": round(float(np.mean([pair.no_reading for pair in pairs])), 4),
         "valid_fraction": round(float(np.mean([pair.valid_fraction for pair in pairs])), 4),
         "native_sizes": sorted({pair.native_size for pair in pairs})[:MAX_SIZES],
         "skipped": skipped,
@@ -172,6 +200,12 @@ def _report(source: Source, info: dict[str, Any], path: Path) -> None:
         source.name, info["pairs"], info["depth_min_m"], info["depth_max_m"], info["depth_median_m"],
         info["encoding"], 100 * info["valid_fraction"], path,
     )  # fmt: skip
+    if info["no_reading"] > 0:
+        log.warning(
+            "%s: %.1f %% of pixels hold the largest value of their type and count as unmeasured; "
+            "data.invalid=[<value>, ...] states such values, data.invalid=[] takes all for depths",
+            source.name, 100 * info["no_reading"],
+        )  # fmt: skip
     if info["skipped"]:
         log.warning("%s: %d pairs skipped:", source.name, len(info["skipped"]))
         for line in info["skipped"]:

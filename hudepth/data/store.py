@@ -4,14 +4,15 @@
 data set                dtype, shape         meaning
 ======================  ===================  ==========================================================
 image                   uint8 [n, h, w, 3]   RGB at training size
-depth_mm                uint16 [n, h, w]     millimetres at training size, 0 where unmeasured
-native/png              uint8 [bytes]        ground truth at native resolution: 16-bit PNGs [mm], one after another
+depth_mm                uint16 [n, h, w]     depth at training size, 0 where unmeasured; millimetres, or as below
+native/png              uint8 [bytes]        ground truth at native resolution: 16-bit PNGs, one after another
 native/end              int64 [n]            where each of them ends
 records/<field>         [n]                  id, scene, frame, split, category of each pair
 ======================  ===================  ==========================================================
 
-The attribute ``info`` is a JSON object with the source's name and fingerprint, encoding, depth range and skipped files.
-A file without it was never finished.
+The attribute ``per_metre`` says how many stored values make a metre: 1000, or 256 for sets that reach beyond 65 m. The
+attribute ``info`` is a JSON object with the source's name and fingerprint, encoding, depth range and skipped files. A
+file without it was never finished.
 """
 
 from __future__ import annotations
@@ -37,19 +38,25 @@ from hudepth.data.sources.files import PerProcess
 
 FORMAT = "hudepth-depth-store"
 VERSION = 1
-MM_PER_M = 1000.0
-MAX_STORED_M = np.iinfo(np.uint16).max / MM_PER_M
-"""65.535 m; larger depths are stored as this."""
+MM_PER_M = 1000
+OUTDOOR_PER_M = 256
+"""Stored values per metre of a set that is not indoors, as KITTI stores them: up to 255.996 m."""
+MAX_STORED = int(np.iinfo(np.uint16).max)
 _TEXTS = ("id", "scene", "split", "category")
 
 
 def to_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Round depths [h, w], finite and not negative [m], to the millimetres a store holds.
+    """Round predicted depths [h, w], finite and not negative [m], to millimetres; beyond 65.535 m they are that."""
+    return to_stored(np.minimum(depth_m, MAX_STORED / float(MM_PER_M)), MM_PER_M)
 
-    0 (unmeasured) stays 0, and a measured depth never becomes 0: below half a millimetre it is stored as one.
+
+def to_stored(depth_m: NDArray[np.float32], per_m: int) -> NDArray[np.uint16]:
+    """Round depths [h, w], finite, not negative and at most 65535 / ``per_m`` [m], to the values a store holds.
+
+    0 (unmeasured) stays 0, and a measured depth never becomes 0: below half a step it is stored as one.
     """
-    mm = np.rint(np.minimum(depth_m, MAX_STORED_M) * MM_PER_M)
-    return np.maximum(mm, depth_m > 0).astype(np.uint16)
+    stored: NDArray[np.float32] = np.rint(depth_m * float(per_m))
+    return np.maximum(stored, depth_m > 0).astype(np.uint16)
 
 
 @contextmanager
@@ -67,17 +74,18 @@ class StoreWriter:
     """Writes a depth store pair by pair, over ``path``. Use it inside :func:`hudepth.base.files.written_whole`.
 
     ``size`` is (height, width) of images and depths; ``native``: whether each pair has ground truth at native
-    resolution. All methods raise OSError if the file cannot be written.
+    resolution; ``per_m``: stored depths are so many to the metre. All methods raise OSError if the file cannot be
+    written.
     """
 
-    def __init__(self, path: Path, *, size: tuple[int, int], native: bool) -> None:
+    def __init__(self, path: Path, *, size: tuple[int, int], native: bool, per_m: int = MM_PER_M) -> None:
         with _plain_os_errors():
             self._file = h5py.File(path, "w", libver="latest")
         self._image, self._depth = (
             self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
             for name, dtype, shape in (("image", "u1", (*size, 3)), ("depth_mm", "u2", size))
         )
-        self._native = native
+        self._native, self._per_m = native, per_m
         if native:
             self._png = self._file.create_dataset("native/png", (0,), "u1", maxshape=(None,), chunks=(1 << 20,))
         self._ends: list[int] = []
@@ -123,6 +131,7 @@ class StoreWriter:
             self._file["records/frame"] = np.array([record.frame for record in self._records], dtype=np.int64)
             self._file.attrs["format"] = FORMAT
             self._file.attrs["version"] = VERSION
+            self._file.attrs["per_metre"] = self._per_m
             self._file.attrs["info"] = json.dumps(info)
             self._file.flush()  # a flush that fails can be aborted, a close that fails cannot
             self._file.close()
@@ -156,6 +165,10 @@ class DepthStore:
                     )
                 self.info: dict[str, Any] = json.loads(file.attrs["info"])
                 self.size: tuple[int, int] = tuple(file["image"].shape[1:3])
+                self.per_m = int(file.attrs.get("per_metre", MM_PER_M))
+                """Stored depths are so many to the metre."""
+                if self.per_m < 1:
+                    raise ValueError(f"per_metre is {self.per_m}")
                 columns = [file[f"records/{field}"].asstr()[:] for field in _TEXTS]
                 frames = file["records/frame"][:].tolist()
                 self.has_native = "native" in file
@@ -174,7 +187,7 @@ class DepthStore:
     def read(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         """Read pairs at training size by their positions, in any order, possibly repeated.
 
-        Returns image [n, h, w, 3] RGB, and depth [n, h, w] in millimetres, 0 where unmeasured.
+        Returns image [n, h, w, 3] RGB, and depth [n, h, w], :attr:`per_m` to the metre, 0 where unmeasured.
         """
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
@@ -210,8 +223,8 @@ class DepthStore:
         file = self._handle.get(self.path)
         ends = file["native/end"]
         start = int(ends[index - 1]) if index else 0
-        mm = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
-        if mm is None:
+        stored = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
+        if stored is None:
             name = self.records[index].id
             raise DataError(f"'{self.path}': the ground truth of '{name}' is damaged. Delete it and prepare again.")
-        return mm.astype(np.float32) / np.float32(MM_PER_M)
+        return stored.astype(np.float32) / np.float32(self.per_m)

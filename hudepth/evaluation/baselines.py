@@ -71,7 +71,7 @@ class NearestFrame(Baseline):
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Return the depth of the nearest training image of each image."""
         _, depth_mm = self._store.read(self.nearest(image))
-        unit = _unit_depth(depth_mm, self._max_depth_m).float()[:, None].to(image.device)
+        unit = _unit_depth(depth_mm, self._store.per_m * self._max_depth_m).float()[:, None].to(image.device)
         return torch.where(unit > 0, unit, self.fill)
 
 
@@ -95,7 +95,7 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
         # pooling first gives the same result faster
         small = functional.adaptive_avg_pool2d(torch.from_numpy(images).permute(0, 3, 1, 2).float(), DESCRIPTOR_SIZE)
         described.append(normalise_image(small / 255).flatten(1))
-        unit = _unit_depth(depth_mm, max_depth_m)
+        unit = _unit_depth(depth_mm, store.per_m * max_depth_m)
         total += unit.sum(dim=0)
         count += (unit > 0).sum(dim=0)
     mean = total.sum() / count.sum()
@@ -108,5 +108,5 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
     }
 
 
-def _unit_depth(depth_mm: np.ndarray, max_depth_m: float) -> Float[Tensor, "n h w"]:
-    return (torch.from_numpy(depth_mm).double() / (1000 * max_depth_m)).clamp_(max=1)
+def _unit_depth(stored: np.ndarray, largest: float) -> Float[Tensor, "n h w"]:
+    return (torch.from_numpy(stored).double() / largest).clamp_(max=1)

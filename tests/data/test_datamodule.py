@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from hudepth.base.types import Batch, RawBatch
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.preprocess import preprocess
 from hudepth.data.sources.base import RawPair, Record, Source
+from hudepth.data.sources.folder import FolderSource
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.data.splits import make_split
 
@@ -296,3 +298,29 @@ def test_a_batch_is_emptied_only_if_it_had_truth_to_lose_whatever_its_teacher_sa
         return image, torch.cat([torch.full_like(depth[:, :1], left), depth[:, 1:]], dim=1)
 
     assert bool(preprocess(raw, max_depth_m=10.0, augment=augment)["emptied"]) is emptied
+
+
+@pytest.mark.parametrize(
+    ("max_depth_m", "level", "share"), [(100, None, ""), (55, "INFO", "50 %"), (20, "WARNING", "100 %")]
+)
+def test_outdoor_depth_and_what_is_clipped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, max_depth_m: float, level: str | None, share: str
+) -> None:
+    depth_m = np.linspace(30, 80, 64).reshape(8, 8)
+    for folder in ("images", "depths"):
+        (tmp_path / folder).mkdir()
+    for i in range(4):
+        cv2.imwrite(str(tmp_path / f"images/{i}.png"), np.full((8, 8, 3), 50 * i, np.uint8))
+        cv2.imwrite(str(tmp_path / f"depths/{i}.png"), np.rint(depth_m * 256).astype(np.uint16))
+    source = FolderSource(tmp_path, encoding="uint16_256", indoor=False)
+    data = DepthDataModule(source, size=8, max_depth_m=max_depth_m, cache=tmp_path / "c", fractions=(0.5, 0.25, 0.25))
+    with caplog.at_level("INFO"):
+        data.prepare_data()
+    said = [record for record in caplog.records if "data.max_depth_m" in record.message]
+    assert [record.levelname for record in said] == ([level] if level else [])
+    assert all(share in record.message for record in said)
+    batch = next(iter(data.test_dataloader()))
+    expected = torch.from_numpy(np.rint(depth_m * 256).astype(np.float32) / 256)
+    torch.testing.assert_close(batch["native_depth"][0][0], expected)
+    unit = preprocess(batch, max_depth_m=max_depth_m)["unit_depth"][0, 0]
+    torch.testing.assert_close(unit, (expected / max_depth_m).clamp(max=1))

@@ -107,7 +107,19 @@ def test_nothing_measured(value: float, depth: str, name: str) -> None:
     source = MemorySource([pair], depth=depth)
     with pytest.raises(DataError) as caught:
         prepare_pair(source, source.records()[0], (2, 2), native=True)
-    assert str(caught.value) == f"'{name}': the depth is zero everywhere, nothing is measured."
+    assert str(caught.value).startswith(f"'{name}': ")
+    assert "nothing is measured" in str(caught.value)
+    assert ("sign" in str(caught.value)) == (value < 0)
+
+
+@pytest.mark.parametrize(("indoor", "largest", "fix"), [(True, 65.6, "indoor=false"), (False, 256.0, "data.invalid")])
+def test_what_a_store_cannot_hold_is_refused(indoor: bool, largest: float, fix: str) -> None:
+    depth = np.full((4, 4), 2.0, np.float32)
+    depth[0, 0] = largest
+    source = MemorySource([RawPair(np.zeros((4, 4, 3), np.uint8), depth)])
+    source.indoor = indoor
+    with pytest.raises(DataError, match=rf"'0': .*{largest:g} m.*{fix}"):
+        prepare_pair(source, source.records()[0], (2, 2), native=True)
 
 
 def test_the_records_scale_and_offset_are_applied() -> None:

@@ -111,10 +111,16 @@ def test_info_states_what_was_measured(root: Path, cache: Path, lines: list[str]
         "depth_min_m": pytest.approx(low, abs=5.1e-4),
         "depth_median_m": pytest.approx(middle, abs=5.1e-4),
         "depth_max_m": pytest.approx(high, abs=5.1e-4),
+        "depth_percentiles_m": store.info["depth_percentiles_m"],
+        "no_reading": 0.0,
         "valid_fraction": pytest.approx(share, abs=5.1e-5),
         "native_sizes": [list(NATIVE)],
         "skipped": [],
     }
+    kept = store.read(range(5))[1]
+    assert store.info["depth_percentiles_m"][::50] == pytest.approx(
+        [np.quantile(kept[kept > 0], q, method="inverted_cdf") / 1000 for q in (0, 0.5, 1)]
+    )
     assert lines == [
         f"folder: 5 pairs, depth {low:.2f} to {high:.2f} m (median {middle:.2f} m, encoding uint16_mm), "
         f"{100 * store.info['valid_fraction']:.1f} % of pixels measured; store {store.path}"
@@ -146,7 +152,7 @@ def everything_in(path: Path) -> dict[str, Any]:
 def test_one_worker_and_two_write_the_same(root: Path, cache: Path) -> None:
     source = write_set(root, 40)
     one, two = (everything_in(prepare(source, size=SIZE, cache=cache / str(n), workers=n).path) for n in (1, 2))
-    assert len(one) == 3 + 4 + 5
+    assert len(one) == 4 + 4 + 5
     assert one == two
 
 
@@ -326,10 +332,8 @@ def test_implausible_units_are_refused_before_the_rest_is_read(root: Path, cache
     source = CountingSource(root, encoding="uint16_mm")
     message = refusal(source, cache, on_error=on_error)
     assert message.startswith("data.encoding=uint16_mm: 'folder' has a median depth of 0.0")
-    assert message.endswith(
-        " m, indoor sets lie in 0.3 to 20 m. Pass another data.encoding "
-        "(uint8_10m, float_m, linear, paper_literal), or data.source.indoor=false for outdoor pairs."
-    )
+    assert "data.encoding=cm (median" in message
+    assert message.endswith("data.source.indoor=false for outdoor pairs.")
     assert len(source.seen) == UNIT_SAMPLES
     assert int(source.seen[-1]) >= 30  # from all of the set
     source.indoor = False

@@ -20,7 +20,7 @@ from hypothesis.extra.numpy import arrays
 
 from hudepth.base.errors import DataError
 from hudepth.data.sources.base import Record
-from hudepth.data.store import DepthStore, StoreWriter, to_mm
+from hudepth.data.store import DepthStore, StoreWriter, to_mm, to_stored
 
 SIZE = (3, 5)
 
@@ -52,6 +52,18 @@ def filled(tmp_path: Path) -> tuple[DepthStore, np.ndarray, np.ndarray, list[np.
     depths = rng.integers(0, 65536, (7, *SIZE), np.uint16)
     natives = [rng.integers(0, 65536, (4 + i, 9 - i), np.uint16) for i in range(7)]
     return write_store(tmp_path / "a.h5", images, depths, natives), images, depths, natives
+
+
+def test_a_store_of_another_scale(tmp_path: Path) -> None:
+    depth_m = np.array([[0, 0.001, 80.25], [255.99609375, 1, 65.6]], np.float32)
+    stored = to_stored(depth_m, 256)
+    writer = StoreWriter(tmp_path / "a.h5", size=(2, 3), native=True, per_m=256)
+    writer.append(Record("a", "", 0), np.zeros((2, 3, 3), np.uint8), stored, png(stored))
+    writer.close({})
+    store = DepthStore(tmp_path / "a.h5")
+    assert store.per_m == 256
+    np.testing.assert_allclose(store.read_native(0), depth_m, atol=1 / 256)
+    np.testing.assert_array_equal(store.read([0])[1][0], stored)
 
 
 @st.composite

@@ -27,6 +27,7 @@ class FakeStore(DepthStore):
     """Truth that is made up, in the form in which a depth store gives it."""
 
     def __init__(self, depth_mm: np.ndarray) -> None:
+        self.per_m = 1000
         self.depth_mm, self.size = depth_mm, depth_mm.shape[1:]  # no file is opened
         self.images = np.random.default_rng(0).integers(0, 256, (*depth_mm.shape, 3)).astype(np.uint8)
 

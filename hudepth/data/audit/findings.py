@@ -46,7 +46,7 @@ def judge_depth(store: DepthStore, scan: Scan, raw: RawSample, *, indoor: bool, 
         "depth and unit": _unit(store.info, indoor=indoor),
         "step of depth": _step(raw),
         "holes": _holes(scan.histogram),
-        "clipping": _clipped(scan.histogram, max_depth_m),
+        "clipping": _clipped(scan.histogram, store.per_m, max_depth_m),
         "saturation": _saturated(raw.at_largest),
         "constant depth": _constant([store.records[i].id for i in scan.constant], len(store)),
         "native size": _sizes(store.info["native_sizes"]),
@@ -103,10 +103,10 @@ def _holes(histogram: NDArray[np.int64]) -> Verdict:
     return "note" if share > 0.01 else "ok", f"{share:.2%} of pixels", meaning, {"share": share}
 
 
-def _clipped(histogram: NDArray[np.int64], max_depth_m: float) -> Verdict:
+def _clipped(histogram: NDArray[np.int64], per_m: int, max_depth_m: float) -> Verdict:
     measured = np.append(0, histogram[1:])
-    largest_m = float(np.flatnonzero(measured).max(initial=0) / 1000)
-    share = float(measured[round(1000 * max_depth_m) :].sum() / max(1, measured.sum()))
+    largest_m = float(np.flatnonzero(measured).max(initial=0) / per_m)
+    share = float(measured[round(per_m * max_depth_m) :].sum() / max(1, measured.sum()))
     found = f"{share:.2%} of measured pixels at {max_depth_m:g} m or more"
     values = {"share": share, "max_depth_m": max_depth_m, "largest_m": largest_m}
     if share > 0.01:

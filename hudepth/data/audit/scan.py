@@ -27,7 +27,7 @@ class Scan:
     digests: list[bytes]
     """[n] equal for images of equal pixels."""
     histogram: NDArray[np.int64]
-    """[65536] pixels of each depth [mm]; those at 0 are unmeasured."""
+    """[65536] pixels of each depth, ``store.per_m`` to the metre; those at 0 are unmeasured."""
     constant: list[int]
     """Positions of pairs whose measured depth is the same everywhere."""
 

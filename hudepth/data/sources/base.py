@@ -8,13 +8,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.errors import DataError
-from hudepth.base.options import check, convert
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.options import Range, check, convert
 from hudepth.data.encoding import Encoding
 
 
@@ -47,6 +47,9 @@ class RawPair:
     depth: NDArray[np.generic]
 
 
+_SCALE = Annotated[float, Range(0, above=True)]
+
+
 class Source(ABC):
     """A data set in some form on disk, or generated: a list of records and a way to read each. Stores bear its name.
 
@@ -64,11 +67,22 @@ class Source(ABC):
     """How depth values become metres; one of :data:`hudepth.data.encoding.ENCODINGS`."""
     indoor: bool = True
     """Whether depths must be plausible for rooms."""
+    depth_scale_m: float | None = None
+    """Scale of ``linear`` and ``disparity`` where a record has none; see :func:`hudepth.data.encoding.to_metres`."""
+    invalid: Sequence[float] | None = None
+    """Stored values that mean "no reading"; None: the largest of an integer type of 16 bits or more."""
     auto_uint8: ClassVar[str | None] = None
     """Encoding of 8-bit depth under ``encoding=auto``; None if only the user can know."""
 
     def __post_init__(self) -> None:  # of sources that are dataclasses: their fields are their options
         self.encoding = convert("data.encoding", self.encoding, Encoding | None)
+        self.depth_scale_m = convert("data.depth_scale_m", self.depth_scale_m, _SCALE | None)
+        self.invalid = convert("data.invalid", self.invalid, list[float] | None)
+        if self.depth_scale_m is not None and self.encoding not in (None, "auto", "linear", "disparity"):
+            raise ConfigError(
+                f"data.depth_scale_m: data.encoding={self.encoding} has a scale of its own. "
+                "Pass data.encoding=linear or disparity, or leave it out."
+            )
         check(self, prefix="data.source.")
 
     @abstractmethod
@@ -93,6 +107,14 @@ class Source(ABC):
             size = path.stat().st_size if path.exists() else -1
             digest.update(f"{path.name}:{size};".encode())
         return digest.hexdigest()
+
+
+@dataclass(eq=False, kw_only=True)
+class EncodedSource(Source):
+    """A source of files, whose values can mean anything: their scale and invalid values are options."""
+
+    depth_scale_m: float | None = None
+    invalid: Sequence[float] | None = None
 
 
 def existing_root(root: str | Path | None, *, expects: str) -> Path:

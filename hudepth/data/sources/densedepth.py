@@ -14,7 +14,7 @@ from hudepth.base.errors import DataError
 from hudepth.base.images import read_bytes
 from hudepth.base.options import Choice
 from hudepth.data.encoding import Encoding
-from hudepth.data.sources.base import RawPair, Record, Source, existing_root
+from hudepth.data.sources.base import EncodedSource, RawPair, Record, existing_root
 from hudepth.data.sources.decoding import read_depth, read_image
 from hudepth.data.sources.files import PerProcess, csv_rows, make_pair
 from hudepth.data.sources.nyu import Nyu, category_of
@@ -30,7 +30,7 @@ _FRAME = {
 
 
 @dataclass(eq=False)
-class DenseDepthSource(Nyu, Source):
+class DenseDepthSource(Nyu, EncodedSource):
     """DenseDepth's ``nyu_data.zip``, in place or unpacked: 50,688 training and 654 test pairs of 640 x 480.
 
     Published by Alhashim and Wonka (2018). Two lists without a header name the files:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
-from hudepth.data.sources.base import RawPair, Record, Source
+from hudepth.data.sources.base import EncodedSource, RawPair, Record
 from hudepth.data.sources.decoding import read_depth, read_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -23,7 +23,7 @@ DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 Handle = TypeVar("Handle")
 
 
-class FileSource(Source):
+class FileSource(EncodedSource):
     """A source whose records name files by their paths relative to a folder."""
 
     @abstractmethod

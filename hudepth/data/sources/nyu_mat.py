@@ -15,7 +15,7 @@ from hudepth.base.images import MAX_PIXELS, check_pixels
 from hudepth.base.options import Choice
 from hudepth.data.encoding import Encoding
 from hudepth.data.sources import nyu
-from hudepth.data.sources.base import RawPair, Record, Source, existing_root
+from hudepth.data.sources.base import EncodedSource, RawPair, Record, existing_root
 from hudepth.data.sources.files import PerProcess, make_pair
 
 _FILE = "nyu_depth_v2_labeled.mat"
@@ -23,7 +23,7 @@ _MAX_NAME = 256
 
 
 @dataclass(eq=False)
-class NyuMatSource(nyu.Nyu, Source):
+class NyuMatSource(nyu.Nyu, EncodedSource):
     """``nyu_depth_v2_labeled.mat`` as the authors publish it: 1449 pairs of 640 x 480 from 464 scenes.
 
     An HDF5 file with MATLAB's header (Silberman, Hoiem, Kohli and Fergus, ECCV 2012). All arrays are

@@ -87,7 +87,7 @@ def test_units_no_room_has_are_warned_of(judge: Judge) -> None:
     dark = (plane() // 40).astype(np.uint8)
     assert judge(dark, encoding="paper_literal")["depth and unit"].severity == "warning"
     assert judge(dark, encoding="uint8_10m")["depth and unit"].severity == "ok"
-    assert judge(plane(20_000, 60_000), indoor=False)["depth and unit"].severity == "ok"
+    assert judge(plane(20_000, 60_000), encoding="uint16_mm", indoor=False)["depth and unit"].severity == "ok"
 
 
 def test_coarse_steps_are_noted(judge: Judge) -> None:

@@ -95,8 +95,8 @@ def test_refusals(tmp_path: Path) -> None:
     assert refusal(NyuRawSource(tmp_path)) == (
         "'a/rgb_00000.jpg' and 'a/rgb_00000.png' are both the image of 'a/00000'. Keep one of them."
     )
-    with pytest.raises(ConfigError, match=r"data\.encoding: 'mm'"):
-        NyuRawSource(tmp_path, encoding="mm").records()
+    with pytest.raises(ConfigError, match=r"data\.encoding: 'metre'"):
+        NyuRawSource(tmp_path, encoding="metre").records()
 
 
 def test_truncated_frame(tmp_path: Path) -> None:
