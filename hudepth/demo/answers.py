@@ -24,10 +24,11 @@ MAX_SIDE = 640  # of the map that goes to the browser [pixels]: more than the ne
 
 
 class Limits(NamedTuple):
-    """The largest picture that is accepted."""
+    """The largest picture that is accepted, and what all visitors' files may hold."""
 
     upload_bytes: int
     pixels: int
+    kept_bytes: int = 200 << 20
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any
 
@@ -15,6 +15,7 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.images import MAX_PIXELS
 from hudepth.base.options import Range, parse
 from hudepth.demo.answers import Limits, answer
+from hudepth.demo.gate import host_names
 from hudepth.demo.server import free_port, serve
 from hudepth.inference.model import ModelOptions, load_model
 
@@ -27,6 +28,8 @@ class DemoOptions(ModelOptions):
     port: Annotated[int, Range(0, 65535)] = 7860
     max_upload_mb: Annotated[float, Range(0, 1024, above=True)] = 20
     max_pixels: Annotated[int, Range(1, MAX_PIXELS)] = 40_000_000
+    max_kept_mb: Annotated[float, Range(0, 2**20, above=True)] = 200
+    allowed_hosts: list[str] = field(default_factory=list)
     intrinsics: CameraOption | None = None
 
 
@@ -36,13 +39,15 @@ def demo(config: dict[str, Any]) -> None:
         raise ConfigError("gradio is not installed. Run pip install 'hudepth[demo]'.")
     options = parse(DemoOptions, {**config, "runs": config["paths"]["runs"]})
     camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
-    limits = Limits(upload_bytes=int(options.max_upload_mb * 2**20), pixels=options.max_pixels)
+    hosts = host_names(options.allowed_hosts)
+    upload, kept = (int(megabytes * 2**20) for megabytes in (options.max_upload_mb, options.max_kept_mb))
+    limits = Limits(upload, options.max_pixels, kept)
     free_port(options.host, options.port)  # before the seconds that loading takes
     model = load_model(options)
     model.predict(np.zeros((*model.info.size, 3), np.uint8))  # the first run is slow; visitors should not wait for it
     serve(
         partial(answer, model=model, limits=limits, intrinsics=camera),
-        host=options.host, port=options.port, limits=limits, info=model.info,
+        host=options.host, port=options.port, limits=limits, info=model.info, allowed_hosts=hosts,
         ready=partial(log.info, "model: %s; open %s (Ctrl-C stops)", model.info),
         camera="as given" if camera else "NYU Depth V2's, since intrinsics= is not set",
     )  # fmt: skip

@@ -86,6 +86,7 @@ def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., It
         except OSError as error:
             log.warning("no files to download: %s", error)
             return
+        files.trim()
         yield (gr.skip(), *(gr.update(value=str(path), interactive=True) for path in paths))
 
     return show

@@ -17,6 +17,7 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError
 from hudepth.demo.answers import Answer, Limits
+from hudepth.demo.gate import guarded, one_line_each
 from hudepth.demo.session_files import Files, draw_examples
 from hudepth.inference.model_info import ModelInfo
 
@@ -28,29 +29,6 @@ SILENCE = {
     "FASTAPI_OTEL_AUTO_CONFIGURE": "false",
 }
 """Settings that keep gradio and its dependencies from sending telemetry."""
-POLICY = (
-    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
-    "style-src 'self' 'unsafe-inline'; object-src 'none'; form-action 'self'; frame-ancestors 'none'"
-)
-"""Browsers load nothing from other hosts. gradio itself needs inline scripts and eval."""
-
-
-class Policy:
-    """ASGI middleware that adds :data:`POLICY` to each response."""
-
-    def __init__(self, app: Any) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Handle a request."""
-
-        async def send_with_policy(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                extra = [(b"content-security-policy", POLICY.encode()), (b"referrer-policy", b"no-referrer")]
-                message = {**message, "headers": [*message.get("headers", []), *extra]}
-            await send(message)
-
-        await self._app(scope, receive, send_with_policy if scope["type"] == "http" else send)
 
 
 def free_port(host: str, port: int) -> int:
@@ -78,6 +56,7 @@ def serve(
     info: ModelInfo,
     camera: str,
     ready: Callable[[str], None],
+    allowed_hosts: frozenset[str] = frozenset(),
 ) -> None:
     """Serve the page until the process is interrupted or terminated; raises ConfigError if the port is taken.
 
@@ -89,13 +68,12 @@ def serve(
         info: of the model.
         camera: whose intrinsics the point cloud uses, in words.
         ready: called with the page's address once it responds.
+        allowed_hosts: names by which requests may call this machine, besides ``localhost`` and its address.
     """
     port = free_port(host, port)
     atexit.register(gc.freeze)  # skips a last garbage collection of all of gradio: two seconds
-    with Files() as files, _ended_by_signals() as ended:
+    with Files(limits.kept_bytes) as files, _ended_by_signals() as ended:
         _silence(files.uploads)
-        from starlette.middleware import Middleware
-
         from hudepth.demo import page
 
         blocks: Any = page.build(compute, files, draw_examples(files.examples), info=info, camera=camera)
@@ -104,8 +82,10 @@ def serve(
                 server_name=host, server_port=port, share=False, inbrowser=False, prevent_thread_lock=True, quiet=True,
                 show_error=True, max_file_size=limits.upload_bytes, ssr_mode=False, mcp_server=False, pwa=False,
                 enable_monitoring=False, run_history=False, footer_links=[], theme=page.THEME,
-                css=page.data_file("viewer.css"), app_kwargs={"middleware": [Middleware(Policy)]},
+                css=page.data_file("viewer.css"),
+                app_kwargs={"lifespan": guarded(files, allowed_hosts | {host.lower()}, limits.upload_bytes)},
             )  # fmt: skip
+            one_line_each()
             ready(address.rstrip("/"))
             ended.wait()
         finally:  # at once: the server would wait for open pages, and log an error when interrupted

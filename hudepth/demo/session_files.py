@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import shutil
 import tempfile
@@ -18,6 +19,7 @@ from hudepth.inference.depth_files import FORMATS, Style, jpeg
 EXAMPLE_ROOMS = (3, 1, 2, 0)  # scenes of the synthetic rooms: a living room, a kitchen, an office, a bedroom
 EXAMPLE_SIZE = (480, 640)
 DOWNLOADS = ("png16", "npy", "ply")  # formats that can be downloaded, in the order of the buttons
+_BLOCK = 4096  # bytes of a disk that the smallest file takes
 
 
 @dataclass
@@ -27,9 +29,13 @@ class _Session:
 
 
 class Files:
-    """The folder of a running page, deleted when it ends; used as ``with Files() as files``."""
+    """The folder of a running page, deleted when it ends; used as ``with Files() as files``.
 
-    def __init__(self) -> None:
+    All sessions together keep at most ``keep_bytes``, or the newest picture's files alone.
+    """
+
+    def __init__(self, keep_bytes: int = 200 << 20) -> None:
+        self.keep_bytes = keep_bytes
         self._sessions: dict[str, _Session] = {}
         self._lock = threading.Lock()
 
@@ -61,6 +67,18 @@ class Files:
         if before.results is not None:
             shutil.rmtree(before.results, ignore_errors=True)
 
+    def trim(self) -> None:
+        """Delete the oldest uploads and results until no more than ``keep_bytes`` are left, whoever owns them."""
+        with self._lock:
+            held = 0
+            entries = [_size(entry) for folder in (self.uploads, self.results) for entry in folder.iterdir()]
+            for number, (_, size, entry) in enumerate(sorted(entries, reverse=True)):
+                held += size
+                if number and held > self.keep_bytes:
+                    shutil.rmtree(entry, ignore_errors=True)
+                    with contextlib.suppress(OSError):
+                        entry.unlink(missing_ok=True)
+
     def write(self, session: str, answer: Answer) -> list[Path]:
         """Write a session's downloads, in the order of :data:`DOWNLOADS`, into a folder with an unguessable name.
 
@@ -78,6 +96,15 @@ class Files:
             with paths[-1].open("wb") as file:
                 write(answer.shown if name == "ply" else answer.depth, file, style)
         return paths
+
+
+def _size(entry: Path) -> tuple[float, int, Path]:
+    """Return when a file or folder was changed, and its bytes on disk; 0 for what has gone meanwhile."""
+    try:
+        sizes = [max(path.lstat().st_size, _BLOCK) for path in (entry, *entry.rglob("*"))]
+        return entry.lstat().st_mtime, sum(sizes), entry
+    except OSError:
+        return 0.0, 0, entry
 
 
 def draw_examples(folder: Path) -> list[Path]:

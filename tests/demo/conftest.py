@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
+import re
 import struct
+import subprocess
+import sys
+import time
 import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +30,35 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def model(checkpoint: Path) -> DepthModel:
     return load(checkpoint, device="cpu", threads=1)
+
+
+@contextlib.contextmanager
+def served(
+    checkpoint: Path, folder: Path, *options: str, **environment: str
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The installed script on a free port, with temporary files in a folder: the process and its address."""
+    (folder / "temporary").mkdir()
+    script = [str(Path(sys.executable).parent / "hudepth-demo"), f"checkpoint={checkpoint}", "port=0", "threads=1"]
+    process = subprocess.Popen(
+        [*script, *options], cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "TMPDIR": str(folder / "temporary"), **environment},
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.fullmatch(r"model: TinyUNet of .*; open (http://127\.0\.0\.1:\d+) \(Ctrl-C stops\)\n", line)
+        assert found, line + process.stdout.read()
+        yield process, found[1]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def until(condition: Callable[[], bool], seconds: float = 10) -> bool:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
 
 
 def encoded(height: int, width: int, kind: str = "PNG") -> bytes:

@@ -7,9 +7,7 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ import pytest
 from hudepth.data.store import to_mm
 from hudepth.inference.model import DepthModel
 
-from .conftest import HOSTILE, encoded
+from .conftest import HOSTILE, encoded, served, until
 
 pytestmark = pytest.mark.slow
 
@@ -66,26 +64,10 @@ def page(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         pytest.skip("no Chromium to open the page with")
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "sitecustomize.py").write_text(WATCH)
-    (folder / "temporary").mkdir()
-    environment = {
-        **os.environ, "OMP_NUM_THREADS": "1", "TMPDIR": str(folder / "temporary"), "CALLS": str(folder / "calls"),
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")])),
-        "GRADIO_HEARTBEAT_INTERVAL": "0.5",
-    }  # fmt: skip
-    script = [str(Path(sys.executable).parent / "hudepth-demo"), f"checkpoint={checkpoint}", "port=0", "threads=1"]
-    process = subprocess.Popen(
-        [*script, "max_upload_mb=0.1"], cwd=folder, env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        found = re.fullmatch(r"model: TinyUNet of .*; open (http://127\.0\.0\.1:\d+) \(Ctrl-C stops\)\n", line)
-        assert found, line + process.stdout.read()
-        yield Page(process, found[1], folder / "temporary", folder / "calls")
-    finally:
-        process.kill()
-        process.wait()
+    path = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+    environment = {"CALLS": str(folder / "calls"), "PYTHONPATH": path, "GRADIO_HEARTBEAT_INTERVAL": "0.5"}
+    with served(checkpoint, folder, "max_upload_mb=0.1", **environment) as (process, url):
+        yield Page(process, url, folder / "temporary", folder / "calls")
 
 
 @pytest.fixture(scope="module")
@@ -113,13 +95,6 @@ def send(tab: Any, name: str, data: bytes) -> None:
 
 def caption(tab: Any, name: str) -> None:
     tab.locator(".hd-caption", has_text=name).wait_for(timeout=10_000)
-
-
-def until(condition: Callable[[], bool], seconds: float = 10) -> bool:
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.05)
-    return condition()
 
 
 PICTURE = encoded(96, 128)

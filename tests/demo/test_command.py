@@ -22,6 +22,9 @@ from tests.commands import Command
         ("intrinsics=[1,2]", r"intrinsics: \[1,2\] .*fx,fy,cx,cy"),
         ("intrinsics=[0,1,2,3]", "intrinsics: .* camera"),
         ("fit=streched", "fit: 'streched' .* 'stretch'"),
+        ("max_kept_mb=0", "max_kept_mb: 0 .* above 0"),
+        ("allowed_hosts=[http://a.b/]", "allowed_hosts: 'http://a.b/' .* name"),
+        ("allowed_hosts=['*']", "allowed_hosts: .* name"),
         ("prot=1", "'prot'.* 'port'"),
     ],
 )

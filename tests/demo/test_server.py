@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-import asyncio
 import socket
-from typing import Any
 
 import pytest
 
 from hudepth.base.errors import ConfigError
-from hudepth.demo.server import POLICY, Policy, free_port
+from hudepth.demo.server import free_port
 
 
 def test_a_port_that_is_taken_is_an_error_with_a_fix() -> None:
@@ -26,17 +24,3 @@ def test_zero_is_any_port() -> None:
 def test_a_host_must_be_an_address_of_this_machine() -> None:
     with pytest.raises(ConfigError, match=r"port: 192\.0\.2\.1:80"):  # an address that nobody has
         free_port("192.0.2.1", 80)
-
-
-def test_every_answer_carries_the_policy() -> None:
-    sent: list[Any] = []
-
-    async def app(scope: Any, receive: Any, send: Any) -> None:
-        await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
-
-    async def send(message: Any) -> None:
-        sent.append(message)
-
-    asyncio.run(Policy(app)({"type": "http"}, None, send))
-    assert sent[0]["headers"][:2] == [(b"a", b"b"), (b"content-security-policy", POLICY.encode())]
-    assert "http" not in POLICY

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,25 @@ def test_what_two_sessions_share_stays_until_both_are_gone() -> None:
         assert path.exists()
         files.end("two")
         assert not path.exists()
+
+
+def test_the_oldest_go_when_all_hold_too_much() -> None:
+    with Files(keep_bytes=100_000) as files:
+        paths = []
+        for number in range(10):
+            paths.append(files.uploads / str(number) / "a.png")
+            paths[-1].parent.mkdir()
+            paths[-1].write_bytes(bytes(30_000))  # whose session never opens
+            os.utime(paths[-1].parent, (number, number))
+        files.trim()
+        assert [path.exists() for path in paths] == [False] * 8 + [True] * 2
+        for number in range(5):
+            path = files.results / str(number) / "a.npy"
+            path.parent.mkdir()
+            path.write_bytes(bytes(300_000))
+            os.utime(path.parent, (100 + number, 100 + number))
+            files.trim()
+            assert kept(files.root) == [path]  # the newest stays, whatever its size
 
 
 def test_examples_and_strange_paths_are_never_deleted(tmp_path: Path) -> None:
