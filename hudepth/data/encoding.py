@@ -97,16 +97,14 @@ def to_metres(
 
     Depths that are NaN, infinite, negative or zero count as unmeasured. So does a stored 0, except under ``linear``,
     where 0 is a value like any other, and what is in ``invalid``: by default, the largest value of an integer type of
-    16 bits or more.
-
-    ``scale_m`` is in metres per unit of the stored value, for ``disparity`` focal length [pixels] times baseline [m], 1
-    for inverse depth; ``offset`` is in units of the stored value; ``where`` names the file in errors. Raises
-    ConfigError if the encoding is unknown; DataError if the values do not fit it, or a scale is missing.
+    16 bits or more. ``scale_m`` is in metres per unit of the stored value, for ``disparity`` focal length [pixels]
+    times baseline [m], 1 for inverse depth; ``offset`` is in units of the stored value; ``where`` names the file in
+    errors. Raises ConfigError if the encoding is unknown; DataError if values do not fit it, or a scale is missing.
     """
     if raw.ndim != 2:
         raise DataError(f"{_prefix(where)}depth has shape {raw.shape}. Store one value per pixel, as [H, W].")
-    has_scale = scale_m is not None
-    name = resolve_encoding(encoding, dtype=raw.dtype, has_scale=has_scale, auto_uint8=auto_uint8, where=where)
+    scaled = scale_m is not None
+    name = resolve_encoding(encoding, dtype=raw.dtype, has_scale=scaled, auto_uint8=auto_uint8, where=where)
     _check_values(raw, name, where)
     values = raw.astype(np.float64)  # float64: one rounding, at the end
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -117,8 +115,7 @@ def to_metres(
         elif name == "uint8_10m":
             values = values / 255 * _FULL_SCALE_8BIT_M
         elif name == "sunrgbd":
-            bits = raw.astype(np.uint16)
-            values = (bits >> 3 | bits << 13).astype(np.float64) / 1000
+            values = _rotated(raw.astype(np.uint16)) / 1000
         else:
             values = values / PER_M[name]
         metres = values.astype(np.float32)
@@ -191,6 +188,10 @@ def suggest(raws: Sequence[NDArray[np.generic]]) -> str:
         if 0.5 <= median <= FAR_INDOORS_M and not (name == "mm" and any("uint16_mm" in text for text in found)):
             found.append(f"data.encoding={name} (median {median:.2g} m)")
     return " or ".join(found)
+
+
+def _rotated(raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    return raw >> 3 | raw << 13
 
 
 def _looks_rotated(raw: NDArray[np.generic]) -> bool:
