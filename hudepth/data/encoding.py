@@ -191,7 +191,7 @@ def suggest(raws: Sequence[NDArray[np.generic]]) -> str:
 
 
 def _rotated(raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    return raw >> 3 | raw << 13
+    return (raw >> 3 | raw << 13).astype(np.uint16)
 
 
 def _looks_rotated(raw: NDArray[np.generic]) -> bool:

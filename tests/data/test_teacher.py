@@ -275,7 +275,7 @@ DAMAGED: dict[str, tuple[str, Callable[[], bytes]]] = {
     "claims a negative size": ("npy", lambda: npy_of("(-1, 4)", body=bytes(64))),
     "pickled": ("npy", lambda: pickle.dumps(np.ones(SIZE))),
     "objects": ("npy", lambda: saved(np.full(SIZE, None))),
-    "3-D": ("npy", lambda: saved(np.ones((1, *SIZE)))),
+    "3-D": ("npy", lambda: saved(np.ones((2, *SIZE)))),
     "1-D": ("npy", lambda: saved(np.ones(24))),
     "a number": ("npy", lambda: saved(np.ones(()))),
     "complex": ("npy", lambda: saved(np.ones(SIZE, complex))),

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image, JpegImagePlugin, PngImagePlugin
 
 from hudepth.base.errors import DataError
-from hudepth.base.images import MAX_PIXELS, check_file, check_pixels, read_bytes
+from hudepth.base.images import MAX_PIXELS, check_pixels, read_bytes
+from hudepth.data.sources.arrays import read_npy, read_pfm
 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB\x60\x82"
 _JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
-_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
+_TIFF = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
+"""Classic TIFF, then BigTIFF, each with its byte order."""
+_EXR, _ZIP = b"v/1\x01", b"PK\x03\x04"
 
 
 def read_image(source: Path | bytes, *, where: str = "") -> NDArray[np.uint8]:
@@ -34,20 +37,42 @@ def read_image(source: Path | bytes, *, where: str = "") -> NDArray[np.uint8]:
 
 
 def read_depth(source: Path | bytes, *, where: str = "") -> NDArray[np.generic]:
-    """Decode a depth map [H, W] without changing its values: PNG of 8 or 16 bits, TIFF, or two-dimensional ``.npy``.
+    """Decode a depth map [H, W] without changing its values: PNG of 8 or 16 bits, TIFF, PFM or ``.npy``.
 
-    Takes a path, or the bytes of a PNG or TIFF. Raises DataError if the file (in errors: ``where``) is missing,
-    truncated, damaged, too large, or has several different channels.
+    Takes a path, or the bytes of a PNG, TIFF or PFM. Grey may be saved as colour or a palette, and where alpha is 0 the
+    value becomes 0; an array may be [1, H, W] or [H, W, 1]. Raises DataError if the file (in errors: ``where``) is
+    missing, truncated, damaged, too large, of another kind, or has several different channels.
     """
     if isinstance(source, Path) and source.suffix.lower() == ".npy":
-        return _read_npy(source, where or f"'{source}'")
+        return read_npy(source, where or f"'{source}'")
     data, where = _load(source, where)
+    if data[:2] == b"Pf" or data[:2] == b"PF":
+        return read_pfm(data, where)
+    _refuse_kind(data, where)
     raw = _decode(data, cv2.IMREAD_UNCHANGED, where)
-    if raw.ndim == 3 and raw.shape[2] == 3 and (raw == raw[..., :1]).all():
-        raw = np.ascontiguousarray(raw[..., 0])  # grey saved as RGB
+    if data[:4] in _TIFF and _tiff_tags(data)[1]:
+        raise DataError(f"{where}: a TIFF of several pages, and which one is depth is unknown. Keep that one.")
+    if raw.ndim == 3 and (raw[..., :3] == raw[..., :1]).all():  # grey saved as RGB, with a palette, or with alpha
+        raw = raw[..., 0] * (raw[..., 3] > 0) if raw.shape[2] == 4 else np.ascontiguousarray(raw[..., 0])
     if raw.ndim != 2:
-        raise DataError(f"{where}: {raw.shape[2]} channels that differ are a picture, not depth. Store one channel.")
+        held = f"{raw.shape[2]} channels of {raw.dtype} that differ"
+        raise DataError(f"{where}: {held} are a picture, not depth. Store one channel of depth values, uncoloured.")
     return raw
+
+
+def _refuse_kind(data: bytes, where: str) -> None:
+    """Refuse files of kinds that people store depth in, but that are not read or lose values."""
+    png = data.startswith(_PNG)
+    if png and data[24:26] == b"\x10\x04":  # some releases of OpenCV swap its bytes
+        raise DataError(f"{where}: a 16-bit grey PNG with alpha, which is not read. Store it without alpha.")
+    if png and data[25:26] == b"\x03" and data[24:25] != b"\x08":
+        raise DataError(f"{where}: a PNG of under 8 bits with a palette. Store grey values instead.")
+    if data.startswith(_JPEG):
+        raise DataError(f"{where}: a JPEG, whose compression changes depths. Store them as 16-bit PNG or .npy.")
+    if data.startswith(_EXR):
+        raise DataError(f"{where}: an OpenEXR file, which is not read. Save its depth channel with numpy.save as .npy.")
+    if data.startswith(_ZIP):
+        raise DataError(f"{where}: an archive of arrays (.npz), which is not read. Save its depth with numpy.save.")
 
 
 def _load(source: Path | bytes, where: str) -> tuple[bytes, str]:
@@ -63,6 +88,9 @@ def _decode(data: bytes, flags: int, where: str) -> NDArray[Any]:
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         decoded = None
+    if decoded is None and data[:4] in _TIFF:
+        held = _describe_tiff(data)
+        raise DataError(f"{where}: damaged, or a TIFF that is not read ({held}). Copy it again, or save it as .npy.")
     if decoded is None or decoded.shape[:2] != (height, width):
         raise DataError(f"{where}: cannot be decoded, the file is damaged. Copy the file again.")
     return decoded
@@ -112,26 +140,31 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def _tiff_size(data: bytes) -> tuple[int, int]:
-    """Read the first directory (TIFF 6.0, section 2). Pillow would also read the values of all tags, however many."""
-    order = _TIFF[data[:4]]
+    tags, _ = _tiff_tags(data)
+    return tags[257], tags[256]
+
+
+def _tiff_tags(data: bytes) -> tuple[dict[int, int], bool]:
+    """Return the first value of each tag of the first directory, and whether there is another.
+
+    TIFF 6.0, section 2. Pillow would also read the values of all tags, however many.
+    """
+    order, big = _TIFF[data[:4]], b"+" in data[2:4]
+    where, counter, entry, step = ("Q", "Q", "HHQ8s", 20) if big else ("I", "H", "HHI4s", 12)
     try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, start)
-        entries = [struct.unpack_from(f"{order}HHI4s", data, start + 2 + 12 * i) for i in range(count)]
+        (start,) = struct.unpack_from(f"{order}{where}", data, 8 if big else 4)
+        (count,) = struct.unpack_from(f"{order}{counter}", data, start)
+        first = start + struct.calcsize(f"={counter}")
+        entries = [struct.unpack_from(f"{order}{entry}", data, first + step * i) for i in range(count)]
     except struct.error:
         raise EOFError("no directory") from None
-    values = {tag: (f"{order}{'H' if kind == 3 else 'I'}", value) for tag, kind, _, value in entries}
-    height, width = (struct.unpack_from(*values[tag])[0] for tag in (257, 256))
-    return height, width
+    end = data[first + step * count :][: struct.calcsize(f"={where}")]
+    kinds = {3: "H", 16: "Q"}
+    values = {tag: struct.unpack_from(f"{order}{kinds.get(kind, 'I')}", value)[0] for tag, kind, _, value in entries}
+    return values, any(end)
 
 
-def _read_npy(path: Path, where: str) -> NDArray[np.generic]:
-    check_file(path)
-    try:  # open_memmap reads the header alone, refuses pickles, and finds files that are cut short
-        mapped = np.lib.format.open_memmap(path, mode="r")
-    except (ValueError, OSError, OverflowError, TypeError, SyntaxError, EOFError):
-        raise DataError(f"{where}: not a complete .npy array of plain numbers. Save it with numpy.save.") from None
-    if mapped.ndim != 2 or mapped.dtype.kind not in "uif":
-        raise DataError(f"{where}: {mapped.dtype} array of shape {mapped.shape}. Save one number per pixel, as [H, W].")
-    check_pixels(*mapped.shape, where=where)
-    return np.array(mapped, dtype=mapped.dtype.newbyteorder("="), order="C", subok=False)
+def _describe_tiff(data: bytes) -> str:
+    tags, _ = _tiff_tags(data)
+    kind = {1: "unsigned", 2: "signed", 3: "float"}.get(tags.get(339, 1), "unknown")
+    return f"{tags.get(258, 1)}-bit {kind}, compression {tags.get(259, 1)}, predictor {tags.get(317, 1)}"

@@ -18,7 +18,9 @@ from hudepth.data.sources.base import EncodedSource, RawPair, Record
 from hudepth.data.sources.decoding import read_depth, read_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff", ".pfm")
+OTHER_DEPTH_SUFFIXES = (".npz", ".exr", ".jpg", ".jpeg")
+"""Looked for where there is none of the former: reading them says why they cannot be read."""
 
 Handle = TypeVar("Handle")
 

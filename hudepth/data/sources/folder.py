@@ -10,7 +10,7 @@ from typing import ClassVar
 from hudepth.base.errors import DataError
 from hudepth.data.encoding import ENCODINGS, Encoding
 from hudepth.data.sources.base import Record, existing_root
-from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, FileSource, inside
+from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, OTHER_DEPTH_SUFFIXES, FileSource, inside
 from hudepth.data.sources.pairing import pair_up, unique_keys, walk_files
 
 
@@ -20,8 +20,8 @@ class FolderSource(FileSource):
 
     ``images/kitchen/01.jpg`` belongs to ``depths/kitchen/01.png``, and its scene is ``kitchen``. With both
     folders ``.``, ``image_suffix="_rgb"`` and ``depth_suffix="_depth"``, ``01_rgb.jpg`` belongs to
-    ``01_depth.png``. Images are JPEG or PNG; depth maps are PNG of 8 or 16 bits, two-dimensional ``.npy``,
-    or TIFF. Files of other kinds are ignored.
+    ``01_depth.png``. Images are JPEG or PNG; depth maps are PNG of 8 or 16 bits, ``.npy``, TIFF or PFM.
+    Files of other kinds are ignored.
 
     ``images`` and ``depths`` are relative to ``root``; suffixes end a name before its extension. ``encoding`` is
     required, since the files do not state it.
@@ -69,6 +69,8 @@ class FolderSource(FileSource):
             )
         images = self._list(root, self.images, self.image_suffix, IMAGE_SUFFIXES, what="images")
         depths = self._list(root, self.depths, self.depth_suffix, DEPTH_SUFFIXES, what="depths")
+        if not depths and not shared:
+            depths = self._list(root, self.depths, self.depth_suffix, OTHER_DEPTH_SUFFIXES, what="depths")
         if shared:  # where one suffix ends with the other, the longer one decides
             longer, shorter = (depths, images) if len(self.depth_suffix) > len(self.image_suffix) else (images, depths)
             taken = {path for _, path in longer}

@@ -185,7 +185,7 @@ def test_colour_is_no_depth(channels: int) -> None:
     picture = np.dstack([RGB, RGB[..., 0]])[..., :channels]
     with pytest.raises(DataError) as caught:
         read_depth(encoded(".png", picture), where="'d.png'")
-    assert message(caught) == (f"'d.png': {channels} channels that differ are a picture, not depth. Store one channel.")
+    assert message(caught).startswith(f"'d.png': {channels} channels of uint8 that differ are a picture")
 
 
 def test_missing_file(tmp_path: Path) -> None:
@@ -221,9 +221,9 @@ def test_jpeg_and_tiff_sizes_are_checked_before_decoding(monkeypatch: pytest.Mon
     jpeg[at : at + 4] = struct.pack(">HH", 60_000, 50_000)
     tiff = struct.pack("<2sHIHHHIIHHII", b"II", 42, 8, 2, 256, 4, 1, 50_000, 257, 4, 1, 60_000)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
-    for data in (bytes(jpeg), tiff):
+    for data, read in ((bytes(jpeg), read_image), (tiff, read_depth)):
         with pytest.raises(DataError) as caught:
-            read_depth(data, where="'a'")
+            read(data, where="'a'")
         assert message(caught) == "'a': 50000 x 60000 pixels, allowed are 1 to 100 million. Resize the file."
 
 
@@ -238,7 +238,7 @@ def test_npy_never_unpickles(tmp_path: Path) -> None:
     np.save(path, np.array([[{"a": 1}]], dtype=object))
     with pytest.raises(DataError) as caught:
         read_depth(path)
-    assert message(caught) == (f"'{path}': not a complete .npy array of plain numbers. Save it with numpy.save.")
+    assert message(caught) == f"'{path}': holds Python objects. Save the depth array inside with numpy.save."
 
 
 def test_npy_size_is_checked_before_reading(tmp_path: Path) -> None:
@@ -277,7 +277,8 @@ def test_npz_under_another_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("array", "found"),
     [
-        (np.zeros((2, 3, 1), np.float32), "float32 array of shape (2, 3, 1)"),
+        (np.zeros((2, 3, 2), np.float32), "float32 array of shape (2, 3, 2)"),
+        (np.zeros((2, 3), bool), "a mask"),
         (np.zeros((2, 3), np.complex64), "complex64 array of shape (2, 3)"),
     ],
 )
@@ -314,3 +315,84 @@ def test_hostile_exif_is_not_read() -> None:
     tracemalloc.stop()
     assert size == RGB.shape[:2]
     assert peak < 2_000_000
+
+
+@pytest.mark.parametrize("shape", [(1, 5, 7), (5, 7, 1)])
+def test_npy_with_an_axis_of_one(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    np.save(tmp_path / "d.npy", DEPTH.reshape(-1)[:35].reshape(shape))
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.npy"), DEPTH.reshape(-1)[:35].reshape(5, 7))
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_pfm(order: str) -> None:
+    depth = np.linspace(1, 4, 12).reshape(3, 4)
+    data = b"Pf\n4 3\n%d.0\n" % (-1 if order == "<" else 1) + depth[::-1].astype(f"{order}f4").tobytes()
+    np.testing.assert_array_equal(read_depth(data), depth.astype(np.float32))
+    for damaged in (data[:-1], b"PF" + data[2:], data.replace(b"4 3", b"x 3")):
+        with pytest.raises(DataError, match="PFM"):
+            read_depth(damaged)
+
+
+def png_of(rows: np.ndarray, kind: int, bits: int, palette: bytes = b"") -> bytes:
+    height, width = rows.shape[:2]
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))
+    pixels = chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)))
+    colours = chunk(b"PLTE", palette) if palette else b""
+    return b"\x89PNG\r\n\x1a\n" + header + colours + pixels + chunk(b"IEND", b"")
+
+
+def test_grey_with_alpha_or_a_palette() -> None:
+    grey = np.arange(1, 13, dtype=np.uint8).reshape(3, 4)
+    alpha = np.where(grey == 5, 0, 255).astype(np.uint8)
+    found = read_depth(png_of(np.dstack([grey, alpha]), 4, 8))
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found, np.where(grey == 5, 0, grey))
+    np.testing.assert_array_equal(read_depth(png_of(grey, 3, 8, bytes(np.repeat(np.arange(256), 3).tolist()))), grey)
+    with pytest.raises(DataError, match="alpha"):
+        read_depth(png_of(np.dstack([grey, alpha]).astype(">u2"), 4, 16))
+    with pytest.raises(DataError, match="picture"):
+        read_depth(png_of(grey, 3, 8, bytes(i * 7 % 256 for i in range(768))))
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [(b"v/1\x01" + bytes(100), "OpenEXR"), (b"PK\x03\x04" + bytes(30), "npz"), (encoded(".jpg", DEPTH >> 8), "JPEG")],
+)
+def test_kinds_that_are_not_read_are_named(data: bytes, word: str) -> None:
+    with pytest.raises(DataError, match=f"'a': .*{word}"):
+        read_depth(data, where="'a'")
+
+
+def tiff(depth: np.ndarray, *, order: str, big: bool, compression: int = 1, more: bytes = bytes(8)) -> bytes:
+    """Write one strip, with its directory behind it."""
+    kind = {"u": 1, "i": 2, "f": 3}[depth.dtype.kind]
+    pixels = depth.astype(depth.dtype.newbyteorder(order)).tobytes()
+    head = struct.pack(f"{order}HHHQ", 43, 8, 0, 16 + len(pixels)) if big else b""
+    head = head or struct.pack(f"{order}HI", 42, 8 + len(pixels))
+    strip = 16 if big else 8
+    tags = {256: depth.shape[1], 257: depth.shape[0], 258: 8 * depth.itemsize, 259: compression, 262: 1, 273: strip}
+    tags |= {277: 1, 278: depth.shape[0], 279: len(pixels), 339: kind}
+    entries = b"".join(
+        struct.pack(f"{order}HHQQ", tag, 16, 1, value) if big else struct.pack(f"{order}HHII", tag, 4, 1, value)
+        for tag, value in tags.items()
+    )
+    count = struct.pack(f"{order}{'Q' if big else 'H'}", len(tags))
+    return (b"II" if order == "<" else b"MM") + head + pixels + count + entries + (more if big else more[:4])
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("dtype", ["u2", "i2", "u4", "i4", "f4", "f8"])
+def test_tiffs(dtype: str, order: str, big: bool) -> None:
+    depth = np.linspace(1, 4000, 12).reshape(3, 4).astype(dtype)
+    np.testing.assert_array_equal(read_depth(tiff(depth, order=order, big=big)), depth)
+
+
+def test_tiffs_that_are_not_read_say_what_they_hold() -> None:
+    depth = np.ones((3, 4), np.float16)
+    with pytest.raises(DataError, match="16-bit float, compression 1, predictor 1"):
+        read_depth(tiff(depth, order="<", big=False))
+    with pytest.raises(DataError, match="compression 50000"):
+        read_depth(tiff(depth.astype("u2"), order="<", big=False, compression=50000))
+    with pytest.raises(DataError, match="several pages"):
+        read_depth(tiff(depth.astype("u2"), order="<", big=False, more=b"\x08\0\0\0"))
