@@ -14,8 +14,13 @@ from typing import Any, cast
 
 from hudepth.base.errors import ConfigError, HudepthError, did_you_mean
 
-TRUSTED = ("hudepth.", "torch.nn.", "torch.optim.", "lightning.pytorch.loggers.", "lightning.pytorch.callbacks.")
-"""Prefixes of modules whose classes a configuration may name."""
+TRUSTED = (
+    "hudepth.", "torch.nn.modules.loss.", "torch.optim.", "lightning.pytorch.loggers.", "lightning.pytorch.callbacks.",
+)  # fmt: skip
+"""Prefixes of modules whose classes a configuration may name: of torch.nn only losses, since nn.LSTM(num_layers=10**8)
+would never be built."""
+_IMPORTED = ("torch.nn.",)
+"""Prefixes under which classes of :data:`TRUSTED` are usually named: torch.nn.L1Loss."""
 
 
 def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type = object, **extra: Any) -> Any:
@@ -90,8 +95,8 @@ def _build(
         return target(*args, **arguments)
     except HudepthError:
         raise
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{config['_target_']}: {error}") from error
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # RuntimeError: torch, of sizes
+        raise ConfigError(f"{config['_target_']}: {(str(error).splitlines() or [''])[0]}") from error
 
 
 def _suggestion(target: type, arguments: Mapping[str, Any]) -> str:
@@ -106,7 +111,7 @@ def _suggestion(target: type, arguments: Mapping[str, Any]) -> str:
 
 
 def _locate(target: str, prefixes: tuple[str, ...]) -> type:
-    if not target.startswith(prefixes):
+    if not target.startswith((*prefixes, *_IMPORTED)):
         raise ConfigError(
             f"_target_: '{target}' is not under a trusted module ({', '.join(p.rstrip('.') for p in prefixes)}). "
             f"If it is your own code, pass trust=[{target.split('.')[0]}]."
@@ -119,7 +124,10 @@ def _locate(target: str, prefixes: tuple[str, ...]) -> type:
     found = getattr(module, name, None)
     if not _is_trusted(found, prefixes):
         classes = [key for key, value in vars(module).items() if _is_trusted(value, prefixes)]
-        raise ConfigError(f"_target_: '{target}' is not a class of a trusted module.{did_you_mean(name, classes)}")
+        fix = did_you_mean(name, classes)
+        if inspect.isclass(found) and target.startswith(_IMPORTED):
+            fix += f" If you want it built, pass trust=[{module_name}]."
+        raise ConfigError(f"_target_: '{target}' is not a class of a trusted module.{fix}")
     return cast(type, found)
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.instantiate import instantiate
 from hudepth.bench.plan import Plan
+from hudepth.models.build import build_network
 from hudepth.models.cost import image_flops, parameters
 from hudepth.models.inference import inference_form
 
@@ -49,7 +49,7 @@ def make_subject(plan: Plan, folder: Path, *, runs: str) -> Subject:
         assert plan.model is not None
         torch.manual_seed(0)
         model, size, max_depth_m = _without_weights(plan.model), plan.size or USUAL_SIZE, USUAL_MAX_DEPTH_M
-        net = instantiate(model, trust=trust, only=object if trust else nn.Module).eval()
+        net = build_network(model, trust=trust).eval()
     state = folder / "state.pt"
     torch.save(net.state_dict(), state)
     return Subject(

@@ -31,6 +31,7 @@ from hudepth.inference.model_info import ModelInfo
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 
+OWN = [PT2, "onnx", "xml"]  # files made here are read without suspicion
 FORMATS = ("onnx", "torch_export", "openvino", "int8", "bundle")
 
 
@@ -80,7 +81,7 @@ class Work:
 
     def compare(self, path: Path, *, backend: str) -> Parity:
         """Compare a file with the checkpoint; raises CheckpointError if it differs by more than the tolerance."""
-        opened = open_exported(path, backend=backend, threads=usable_cores(), trust=[PT2])
+        opened = open_exported(path, backend=backend, threads=usable_cores(), trust=OWN)
         parity = compare(opened, self.reference, self.images.compared)
         check(parity, what=path.name, tolerance_mm=self.options.tolerance_mm)
         return parity
@@ -150,7 +151,7 @@ def _int8(work: Work) -> dict[str, Any]:
     check_calibration(len(images.calibration))
     path, info = work.folder / "model_int8.xml", replace(work.info, processing=True)
     quantise(work.onnx(info), path, info=info, images=images.calibration)
-    quantised = open_exported(path, backend="openvino", threads=usable_cores(), trust=[])
+    quantised = open_exported(path, backend="openvino", threads=usable_cores(), trust=OWN)
     parity = compare(quantised, work.reference, images.compared)
     accuracy: dict[str, Any] = {}
     if options.accuracy and images.datamodule is not None:

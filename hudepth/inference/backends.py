@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.normalise import NormaliseBytes
 from hudepth.inference.model_info import KEY, ModelInfo
-from hudepth.inference.runtimes import onnx_session, openvino_model
+from hudepth.inference.runtimes import onnx_session, openvino_model, package
+from hudepth.inference.trial import try_graph
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint
 
@@ -90,13 +91,30 @@ class GraphBackend:
         return np.maximum(unit_depth[:, 0] * np.float32(self.info.max_depth_m), np.float32(0))
 
 
+def _check_fits(path: Path, info: ModelInfo, found: dict[str, Any]) -> None:
+    """Refuse a graph that takes or returns something else than its description says."""
+    height, width = info.size
+    takes, returns = ("uint8", [height, width, 3]), ("float32", [height, width])
+    if not info.processing:
+        takes, returns = ("float32", [3, height, width]), ("float32", [1, height, width])
+    for what, wanted, given in (("take", takes, found["inputs"]), ("return", returns, found["outputs"])):
+        if [(kind, shape[1:]) for kind, shape in given] != [wanted]:
+            stated = ", ".join(f"{kind} {shape}" for kind, shape in given)
+            raise CheckpointError(
+                f"'{path}': its description does not fit its graph, which should {what} {wanted[0]} [batch, "
+                f"{', '.join(map(str, wanted[1]))}] and has {stated or 'nothing'}. Export it again with hudepth-export."
+            )
+
+
 def open_exported(
     path: Path, *, backend: str = "auto", threads: int, trust: list[str], precision: str = "float32"
 ) -> GraphBackend:
     """Open an exported file; ``auto`` reads ONNX with OpenVINO if installed, since it is faster.
 
-    Raises CheckpointError if it cannot be read, is not trusted (``.pt2`` needs ``pt2`` in ``trust``), or was not
-    exported by hudepth; ConfigError if the backend does not read such files or is not installed.
+    A graph is first tried under limits of time and memory, unless its suffix (``onnx``, ``xml``) is in ``trust``.
+
+    Raises CheckpointError if it cannot be read, is not trusted (``.pt2`` needs ``pt2`` in ``trust``), was not exported
+    by hudepth, or does not fit its description; ConfigError if the backend does not read it or is not installed.
     """
     usual = EXPORTED[path.suffix.lower()]
     readers = sorted({usual, "openvino"}) if usual == "onnxruntime" else [usual]
@@ -109,6 +127,10 @@ def open_exported(
     if backend == "torch" and PT2 not in trust:
         fix = f"If you exported it yourself, pass trust=[{PT2}]; otherwise ask for an ONNX file or a bundle."
         raise CheckpointError(f"'{path}' is a program that could run any code when loaded. {fix}")
+    if backend != "torch":
+        package(backend, extra="onnx" if backend == "onnxruntime" else backend)  # in this process, for its message
+    suffix = path.suffix[1:].lower()
+    found = None if suffix in trust else try_graph(path, backend=backend, threads=threads)
     try:
         if backend == "torch":
             text, compute = _open_program(path)
@@ -125,7 +147,10 @@ def open_exported(
     if not text:
         why = "its size and units are unknown. Export a checkpoint with hudepth-export."
         raise CheckpointError(f"'{path}' was not exported by hudepth: {why}")
-    return GraphBackend(backend, ModelInfo.from_json(text, where=f"'{path}'"), compute)
+    info = ModelInfo.from_json(text, where=f"'{path}'")
+    if found is not None:
+        _check_fits(path, info, found)
+    return GraphBackend(backend, info, compute)
 
 
 Opened = tuple[str, Callable[[NDArray[Any]], NDArray[Any]]]  # description as JSON ("" if none), and what runs it

@@ -45,7 +45,7 @@ class GradientMatching(SingleTermLoss):
 
     def __init__(self, *, scales: int = 4) -> None:
         super().__init__()
-        self.scales = convert("loss.scales", scales, Annotated[int, Range(1)], default=4)
+        self.scales = convert("loss.scales", scales, Annotated[int, Range(1, 16)], default=4)
 
     def value(self, pred: Tensor, target: Tensor, valid: Tensor) -> Tensor:
         """Return :func:`gradient_matching_loss`."""

@@ -42,7 +42,7 @@ class ResNet18UNet(UNet):
         upsample: UpsampleMode = "nearest",
         output: str = "sigmoid",
     ) -> None:
-        convert("model.attention_layers", attention_layers, Annotated[int, Range(0)], default=0)
+        convert("model.attention_layers", attention_layers, Annotated[int, Range(0, 64)], default=0)
         encoder = ResNet18Encoder.from_pretrained(weights, layers=4)
         block = partial(
             TransformerBlock, heads=attention_heads, activation=attention_activation, positions=attention_positions

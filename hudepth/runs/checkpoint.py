@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hudepth.base.errors import CheckpointError, TrainingError
 from hudepth.base.files import written_whole
-from hudepth.base.instantiate import instantiate
+from hudepth.models.build import build_network
 from hudepth.runs import bundles
 from hudepth.runs.run import best_checkpoint, find_run, is_run, newest_run
 
@@ -68,13 +68,12 @@ class Checkpoint:
         model = dict(self.config["model"])
         if "weights" in model:
             model["weights"] = None  # no longer needed
-        only = object if trust else nn.Module
         if not trust:
             if sum(tensor.nbytes for tensor in self.state.values()) > self.size_bytes:
                 raise CheckpointError(f"'{self.path}' is refused: its tensors claim more memory than the file holds.")
             with torch.device("meta"):
-                self._check_fits(instantiate(model, only=only))
-        net: nn.Module = instantiate(model, trust=trust, only=only)
+                self._check_fits(build_network(model))
+        net = build_network(model, trust=trust)
         self.fill(net)
         return net.eval()
 

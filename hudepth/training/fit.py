@@ -23,6 +23,7 @@ from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.score import ScoreOptions, score_checkpoint
+from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint
@@ -42,7 +43,7 @@ def fit(training: Training) -> float | None:
     keep_freed_memory()
     import_trusted(options.trust)
     data = build_datamodule(training)
-    net: nn.Module = instantiate(config["model"], trust=options.trust, only=nn.Module)
+    net = build_network(config["model"], trust=options.trust)
     net.to(memory_format=MEMORY_FORMATS[options.memory_format])  # type: ignore[call-overload]
     check_input(net, data.sizes)
     restore_split(training, data)

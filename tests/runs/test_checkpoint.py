@@ -247,7 +247,7 @@ def test_a_configuration_that_writes_files_is_refused(tmp_path: Path) -> None:
     victim.write_text("mine")
     writer = {"_target_": "hudepth.data.store.StoreWriter", "path": str(victim), "size": [1, 1], "native": False}
     path = written(tmp_path, writer, TinyUNet())
-    with pytest.raises(ConfigError, match=r"StoreWriter' is no Module, which is what belongs here"):
+    with pytest.raises(ConfigError, match=r"StoreWriter' is no depth network"):
         load_checkpoint(str(path)).build_net(trust=[])
     assert victim.read_text() == "mine"
 

@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from torch import nn
 
-from hudepth.base.instantiate import instantiate
+from hudepth.models.build import build_network
 from hudepth.models.cost import counted_flops, parameters
 from hudepth.report.ablation.estimates import Estimate
 from hudepth.report.ablation.report import Report
@@ -53,7 +52,7 @@ def _count(config: Mapping[str, Any], trust: Sequence[str]) -> tuple[int, int]:
     if "weights" in model:
         model["weights"] = None  # pretrained weights do not change the cost
     with torch.device("meta"):
-        network = instantiate(model, trust=trust, only=object if trust else nn.Module)
+        network = build_network(model, trust=trust)
     image = torch.empty(1, 3, *(int(side) for side in config["data"]["size"]), device="meta")
     return parameters(network), counted_flops(network, image) // 2
 
