@@ -1,4 +1,4 @@
-"""How stored depth values become metres, and the check that the result is plausible.
+"""How stored depth values become metres.
 
 Like the sources, this module does not import torch: worker processes import it and should start fast.
 """
@@ -6,7 +6,7 @@ Like the sources, this module does not import torch: worker processes import it 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,25 +24,10 @@ ENCODINGS = ("auto", *PER_M, "uint8_10m", "sunrgbd", "linear", "disparity")
 Encoding = Annotated[str, Choice(ENCODINGS)]
 """One of :data:`ENCODINGS`, as the type of an option."""
 
-INDOOR_MEDIAN_M = (0.3, 20.0)
-"""Median depths [m] an indoor set can have; a wrong unit lands far outside."""
-FAR_INDOORS_M = 8.0
-"""An indoor set with a median beyond it [m] gets a warning."""
-
-_AUTO_MAX_M = 15.0  # sensors that store 16-bit millimetres see no farther; KITTI read so reaches 20 m
 _FULL_SCALE_8BIT_M = 10.0  # DenseDepth's training PNGs: 255 is 10 m
 _ADVICE_8BIT = (
     "Use data.encoding=uint8_10m for value/255*10 m, or data.encoding=paper_literal to read it so on purpose."
 )
-
-
-class DepthRange(NamedTuple):
-    """Measured depths of a sample [m], and the share of pixels that are measured, in (0, 1]."""
-
-    min_m: float
-    median_m: float
-    max_m: float
-    valid_fraction: float
 
 
 def resolve_encoding(
@@ -135,75 +120,8 @@ def is_invalid(raw: NDArray[np.generic], invalid: Sequence[float] | None) -> NDA
     return np.isin(raw.astype(np.float64), values)
 
 
-def check_range(
-    depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str,
-    raws: Sequence[NDArray[np.generic]] = (),
-) -> DepthRange:  # fmt: skip
-    """Measure the range of a sample of depths [H, W] in metres, 0 where unmeasured.
-
-    Raises DataError if nothing is measured, if an indoor set's median is outside :data:`INDOOR_MEDIAN_M`, except under
-    ``paper_literal``, which is implausible on purpose, or if ``auto`` would take values for millimetres that need not
-    be any. ``name`` is the set's, for errors; they name encodings that would make ``raws``, the same depths as
-    stored, plausible for a room.
-    """
-    others = ", ".join(other for other in ENCODINGS if other not in (encoding, "auto"))
-    measured = np.concatenate([depth[depth > 0] for depth in depths] or [np.zeros(0, np.float32)])
-    if measured.size == 0:
-        raise DataError(
-            f"data.encoding={encoding}: no pixel of '{name}' is measured in {len(depths)} depth maps. "
-            f"Check data.root, or pass another data.encoding ({others})."
-        )
-    share = measured.size / sum(depth.size for depth in depths)
-    found = DepthRange(float(measured.min()), float(np.median(measured)), float(measured.max()), share)
-    as_mm = encoding == "auto" and any(raw.dtype.kind == "u" and raw.dtype.itemsize == 2 for raw in raws)
-    if as_mm and (not indoor or found.max_m > _AUTO_MAX_M):
-        raise DataError(
-            f"data.encoding=auto: '{name}' holds 16-bit depth up to {found.max_m:.3g} m if it is millimetres, but "
-            "it may be KITTI's 1/256 m or another unit. Pass data.encoding=uint16_256, uint16_mm, or another unit."
-        )
-    low, high = INDOOR_MEDIAN_M
-    if indoor and encoding != "paper_literal" and not low <= found.median_m <= high:
-        raise DataError(
-            f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, "
-            f"indoor sets lie in {low:g} to {high:g} m. Pass "
-            f"{suggest(raws) or f'another data.encoding ({others})'}, or data.source.indoor=false for outdoor pairs."
-        )
-    return found
-
-
-def suggest(raws: Sequence[NDArray[np.generic]]) -> str:
-    """Return the encodings that give stored depths a median typical of rooms, each with it; empty if none does."""
-    found: list[str] = []
-    for name in ENCODINGS[1:]:
-        if name in ("paper_literal", "linear", "disparity"):  # wrong on purpose, or in need of a scale
-            continue
-        # The lowest bits of SUN RGB-D are the highest of the depth, which rooms leave empty.
-        if name == "sunrgbd" and not all(map(_looks_rotated, raws)):
-            continue
-        try:
-            depths = [depth[depth > 0] for depth in (to_metres(raw, name) for raw in raws)]
-        except DataError:
-            continue
-        median = float(np.median(np.concatenate(depths))) if any(map(len, depths)) else 0.0
-        if 0.5 <= median <= FAR_INDOORS_M and not (name == "mm" and any("uint16_mm" in text for text in found)):
-            found.append(f"data.encoding={name} (median {median:.2g} m)")
-    return " or ".join(found)
-
-
 def _rotated(raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return (raw >> 3 | raw << 13).astype(np.uint16)
-
-
-def _looks_rotated(raw: NDArray[np.generic]) -> bool:
-    return raw.dtype == np.uint16 and bool(np.mean(raw.astype(np.uint16) & 7 == 0) > 0.9)
-
-
-def looks_swapped(raw: NDArray[np.generic]) -> bool:
-    """Return whether 16-bit values [H, W] are noise as they are, but a smooth surface with their bytes swapped."""
-    if raw.dtype not in (np.uint16, np.int16) or raw.shape[1] < 2:
-        return False
-    given, swapped = (np.abs(np.diff(values.astype(np.float64))).mean() for values in (raw, raw.byteswap()))
-    return bool(given > 0.1 * np.ptp(raw.astype(np.float64)) and swapped < given / 8)
 
 
 def _check_values(raw: NDArray[np.generic], name: str, where: str) -> None:

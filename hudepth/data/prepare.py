@@ -20,10 +20,10 @@ from hudepth.base.console import log, track
 from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
 from hudepth.base.options import convert
-from hudepth.data.encoding import FAR_INDOORS_M, check_range, looks_swapped, suggest
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres, values_per_metre
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.sources.contents import hash_contents
+from hudepth.data.sources.plausible import FAR_INDOORS_M, check_range, looks_swapped, suggest
 from hudepth.data.store import MAX_STORED, VERSION, DepthStore, StoreWriter
 
 MAX_SIZES = 16

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hudepth.data.audit.duplicates import Duplicates
 from hudepth.data.audit.leakage import Leakage
 from hudepth.data.audit.scan import RawSample, Scan
-from hudepth.data.encoding import INDOOR_MEDIAN_M
+from hudepth.data.sources.plausible import INDOOR_MEDIAN_M
 from hudepth.data.store import DepthStore
 
 COARSE_MM = 10.0

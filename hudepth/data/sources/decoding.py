@@ -65,8 +65,8 @@ def _refuse_kind(data: bytes, where: str) -> None:
     png = data.startswith(_PNG)
     if png and data[24:26] == b"\x10\x04":  # some releases of OpenCV swap its bytes
         raise DataError(f"{where}: a 16-bit grey PNG with alpha, which is not read. Store it without alpha.")
-    if png and data[25:26] == b"\x03" and data[24:25] != b"\x08":
-        raise DataError(f"{where}: a PNG of under 8 bits with a palette. Store grey values instead.")
+    if png and data[24:25] in (b"\x01", b"\x02", b"\x04"):  # decoders stretch them
+        raise DataError(f"{where}: a PNG of {data[24]} bits a pixel, too few for depth. Store 16 bits.")
     if data.startswith(_JPEG):
         raise DataError(f"{where}: a JPEG, whose compression changes depths. Store them as 16-bit PNG or .npy.")
     if data.startswith(_EXR):

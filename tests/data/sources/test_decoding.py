@@ -356,7 +356,12 @@ def test_grey_with_alpha_or_a_palette() -> None:
 
 @pytest.mark.parametrize(
     ("data", "word"),
-    [(b"v/1\x01" + bytes(100), "OpenEXR"), (b"PK\x03\x04" + bytes(30), "npz"), (encoded(".jpg", DEPTH >> 8), "JPEG")],
+    [
+        (b"v/1\x01" + bytes(100), "OpenEXR"),
+        (png_of(np.zeros((2, 4), np.uint8), 0, 4), "4 bits"),
+        (b"PK\x03\x04" + bytes(30), "npz"),
+        (encoded(".jpg", DEPTH >> 8), "JPEG"),
+    ],
 )
 def test_kinds_that_are_not_read_are_named(data: bytes, word: str) -> None:
     with pytest.raises(DataError, match=f"'a': .*{word}"):
