@@ -11,33 +11,42 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 from PIL import (
+    AvifImagePlugin,
     BmpImagePlugin,
     GifImagePlugin,
     Image,
-    ImageOps,
     JpegImagePlugin,
     PngImagePlugin,
     PpmImagePlugin,
     TiffImagePlugin,
     UnidentifiedImageError,
     WebPImagePlugin,
+    features,
 )
 
 from hudepth.base.errors import DataError
+from hudepth.base.exif import check_tags, orientation
 
 _PLUGINS = (
     JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin, TiffImagePlugin, GifImagePlugin,
-    PpmImagePlugin,
+    PpmImagePlugin, *([AvifImagePlugin] if features.check("avif") else []),
 )  # fmt: skip
 FORMATS = tuple(plugin.__name__.rpartition(".")[2].removesuffix("ImagePlugin").upper() for plugin in _PLUGINS)
 """What is decoded. Pillow would also take formats that start other programs, as EPS does Ghostscript."""
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif", ".ppm", ".pgm")
+SUFFIXES = (
+    ".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff", ".gif", ".ppm", ".pgm",
+)  # fmt: skip
 """Extensions that are looked for in folders, in lower case."""
 
 MAX_PIXELS = 100_000_000
 """Larger images are refused before they are decoded."""
 
-
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}  # fmt: skip
+"""What brings a picture of each orientation upright."""
 MAX_FILE_BYTES = 1 << 30
 """Larger files are refused before they are read."""
 
@@ -70,6 +79,7 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
     if not data:
         raise DataError(f"{where}: the file is empty (0 bytes). Copy it again.")
     try:
+        check_tags(data, where=where)
         with Image.open(io.BytesIO(data), formats=FORMATS) as image:
             check_pixels(image.height, image.width, where=where, most=max_pixels)
             notes = _notes(image)
@@ -78,7 +88,8 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
     except DataError:
         raise
     except UnidentifiedImageError:
-        raise DataError(f"{where}: no image that can be read. Pass a {', '.join(FORMATS)}.") from None
+        kind = "HEIC and its like are not read here" if data[4:8] == b"ftyp" else "no image that can be read"
+        raise DataError(f"{where}: {kind}. Pass a {', '.join(FORMATS)}.") from None
     except Image.DecompressionBombError:
         raise DataError(f"{where}: more pixels than are decoded here. Resize the file.") from None
     except Exception as error:  # decoders know dozens of ways in which a file can be broken
@@ -88,13 +99,16 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
 
 
 def _notes(image: Image.Image) -> tuple[str, ...]:
+    if image.format == "TIFF":  # counting its pages would read all their tags
+        return ()
     frames = int(getattr(image, "n_frames", 1))
     animated = frames > 1 and image.format != "MPO"  # whose further frames are thumbnails or a second eye
     return (f"animated, {frames} frames: the first is taken",) if animated else ()
 
 
 def _to_rgb(image: Image.Image, where: str) -> UInt8[np.ndarray, "h w 3"]:
-    upright = ImageOps.exif_transpose(image)
+    turn = _TURNS.get(orientation(image))
+    upright = image if turn is None else image.transpose(turn)
     if upright.mode == "RGB":
         return np.asarray(upright, np.uint8)
     if upright.mode.startswith("I"):  # 16 bits of grey, which Pillow may hold in 32
@@ -133,6 +147,20 @@ def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h
         alpha = array[..., 3:].astype(np.float32) / 255
         array = np.rint(array[..., :3] * alpha + 255 * (1 - alpha))
     return np.ascontiguousarray(array, np.uint8)
+
+
+def is_image(path: Path) -> bool:
+    """Return whether a file begins as an image does; False if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError:
+        return False
+    return (
+        head.startswith((b"\xff\xd8\xff", b"\x89PNG", b"GIF8", b"II*\0", b"MM\0*"))
+        or head[4:8] == b"ftyp"
+        or (head[:4] == b"RIFF" and head[8:12] == b"WEBP")
+    )
 
 
 def read_bytes(path: Path) -> bytes:

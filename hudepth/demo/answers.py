@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from hudepth.base.camera import Intrinsics
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.images import read_photo, resize_image
 from hudepth.data.store import to_mm
 from hudepth.inference.depth_files import jpeg
@@ -53,7 +53,12 @@ def answer(path: Path, model: DepthModel, limits: Limits, intrinsics: Intrinsics
     depth = replace(model.predict(photo.rgb), notes=photo.notes)
     shown = reduce_depth(depth)
     (height, width), (rows, columns) = depth.metres.shape, shown.metres.shape
-    camera = (intrinsics or Intrinsics.of_nyu(height, width)).scale(columns / width, rows / height)
+    try:
+        (intrinsics or Intrinsics.of_photo(height, width)).check_fit(height, width)
+    except ConfigError:
+        note = "intrinsics= are not of a picture of this size, NYU's stand in for them"
+        intrinsics, depth = None, replace(depth, notes=(*depth.notes, note))
+    camera = (intrinsics or Intrinsics.of_photo(height, width)).scale(columns / width, rows / height)
     payload = {
         "width": columns,
         "height": rows,

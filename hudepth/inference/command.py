@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -26,6 +27,8 @@ from hudepth.inference.video import FrameReader, VideoWriter
 
 IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]  # defaults
 PICTURES = {"colour": "_depth.mp4", "side": "_side.mp4"}  # formats that make a video of a video, and its ending
+
+_FOR_ALL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}  # what ends a run: a full or broken disk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +66,10 @@ def predict(config: dict[str, Any]) -> None:
     """Predict all inputs of conf/predict.yaml; raises HudepthError, for unreadable inputs once all others are done."""
     options = parse(PredictOptions, {**config, "runs": config["paths"]["runs"]})
     camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
-    inputs = find_inputs(options.input, recursive=options.recursive)
+    inputs = find_inputs(options.input, recursive=options.recursive, output=Path(options.output).expanduser())
     output = output_folder(options.output)
+    for line in inputs.left_out:
+        log.info("%s", line)
     if output.resolve() in {item.path.parent.resolve() for item in (*inputs.images, *inputs.videos)}:
         raise ConfigError(f"output: '{output}' is the folder of the input. Pass another, output=<folder>.")
     model = load_model(options)
@@ -76,7 +81,10 @@ def predict(config: dict[str, Any]) -> None:
         if inputs.images:
             _predict_images(job, inputs.images)
         for video in inputs.videos:
-            _predict_frames(job, video.path, output / video.stem, VIDEO_FORMATS)
+            try:
+                _predict_frames(job, video.path, output / video.stem, VIDEO_FORMATS)
+            except (DataError, OSError) as error:
+                job.tally.failed[str(video.path)] = f"'{video.path}': {_own_fault(error)}"
         if inputs.camera is not None:
             _predict_frames(job, inputs.camera, output / f"camera{inputs.camera}", CAMERA_FORMATS)
     except OSError as error:
@@ -94,8 +102,13 @@ def _predict_images(job: Job, items: list[Item]) -> None:
     device = getattr(job.model.backend, "device", None)
     on_gpu = device is not None and device.type != "cpu"
 
+    unwritten: dict[str, str] = {}
+
     def write(key: str, depth: DepthMap) -> None:
-        write_depth(stems[key], depth, options.formats or IMAGE_FORMATS, job.style)
+        try:
+            write_depth(stems[key], depth, options.formats or IMAGE_FORMATS, job.style)
+        except (DataError, OSError) as error:
+            unwritten[key] = f"'{key}': {_own_fault(error)}"
 
     stream: Stream[str] = Stream(
         job.model,
@@ -106,6 +119,17 @@ def _predict_images(job: Job, items: list[Item]) -> None:
     )
     for _ in track(stream.run((str(i.path), i.path) for i in items), total=len(items), what="predicting"):
         pass
+    job.tally.failed.update(unwritten)
+    job.tally.done -= len(unwritten)
+
+
+def _own_fault(error: DataError | OSError) -> str:
+    """Return why one input's results cannot be written; raises the error if no other's could either."""
+    if isinstance(error, DataError):
+        return str(error)
+    if error.errno in _FOR_ALL:
+        raise error
+    return f"its results cannot be written ({error.strerror or error}). Pass another output=<folder>."
 
 
 def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]) -> None:

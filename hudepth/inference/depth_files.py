@@ -12,8 +12,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from hudepth.base.camera import Intrinsics
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import written_whole
 from hudepth.inference.depth_map import DepthMap
+
+MAX_JPEG_SIDE = 65_500  # pixels, by libjpeg
 
 
 @dataclass(frozen=True)
@@ -35,14 +38,26 @@ FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] =
 
 
 def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Style) -> None:
-    """Write ``<stem>_depth.png`` and so on in formats of :data:`FORMATS`, each whole or not at all; raises OSError."""
+    """Write ``<stem>_depth.png`` and so on in formats of :data:`FORMATS`, each whole or not at all.
+
+    Raises OSError, and DataError, once all others are written, with the formats that cannot hold this picture.
+    """
+    failed = []
     for name in formats:
         ending, write = FORMATS[name]
-        with written_whole(stem.with_name(stem.name + ending), durable=False) as part, part.open("wb") as file:
-            write(depth, file, style)
+        try:
+            with written_whole(stem.with_name(stem.name + ending), durable=False) as part, part.open("wb") as file:
+                write(depth, file, style)
+        except (DataError, ConfigError) as error:
+            failed.append(f"no {name}: {error}")
+    if failed:
+        raise DataError(" ".join(failed))
 
 
 def jpeg(rgb: UInt8[np.ndarray, "h w 3"], *, quality: int = 92) -> bytes:
-    """Return a picture as a JPEG file."""
+    """Return a picture as a JPEG file; raises DataError if it is too wide or too high for one."""
+    height, width = rgb.shape[:2]
+    if max(height, width) > MAX_JPEG_SIDE:
+        raise DataError(f"a JPEG of {width} x {height} pixels, allowed are {MAX_JPEG_SIDE}. Use formats=[png16,npy].")
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

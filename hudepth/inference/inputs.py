@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import glob
 import itertools
+import re
 from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
 from hudepth.base.errors import DataError
-from hudepth.base.images import SUFFIXES
+from hudepth.base.images import SUFFIXES, is_image
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+VIDEO_SUFFIXES = (
+    ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv",
+)  # fmt: skip
+UNREAD_SUFFIXES = (".heic", ".heif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
+"""Photographs that are not decoded here: they are tried, so that each is listed with the reason."""
+_RESULT = re.compile(r".+_(depth|side)\.(png|jpg|mp4)")  # as inference/depth_files.py names pictures
 
 
 class Item(NamedTuple):
@@ -27,13 +33,16 @@ class Inputs(NamedTuple):
     images: list[Item]
     videos: list[Item]
     camera: int | None = None
+    left_out: tuple[str, ...] = ()
+    """Lines that count and name files of a folder that are no inputs."""
 
 
-def find_inputs(spec: str, *, recursive: bool) -> Inputs:
+def find_inputs(spec: str, *, recursive: bool, output: Path | None = None) -> Inputs:
     """Return the files or camera that ``spec`` names, sorted; raises DataError if there is nothing to predict.
 
     ``spec`` is a file, a folder, a pattern with ``*``, ``?`` or ``**``, or the number of a camera; ``recursive``
-    searches subfolders, whose names are kept in the results.
+    searches subfolders, whose names are kept in the results. Files below ``output`` and results of earlier runs are
+    left out.
     """
     if spec.isdecimal() and not Path(spec).exists():
         return Inputs([], [], camera=int(spec))
@@ -49,9 +58,17 @@ def find_inputs(spec: str, *, recursive: bool) -> Inputs:
             wanted = "an image, folder, 'pattern', video or camera"
             raise DataError(f"input: no file, folder or match '{spec}'. Pass {wanted}.")
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
-    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     alone = path.is_file()  # a file that is named is read, whatever its ending
-    images = [f for f in files if f not in videos and (alone or f.suffix.lower() in SUFFIXES)]
+    results = [] if alone else [file for file in files if _is_result(file, root, output)]
+    files = [file for file in files if file not in set(results)]
+    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+    images = [f for f in files if f not in videos and (alone or _is_photo(f))]
+    others = [file for file in files if file not in {*images, *videos}]
+    left_out = [
+        f"left out, {what}: {_names(found)}"
+        for what, found in (("results of hudepth-predict", results), ("neither image nor video", others))
+        if found
+    ]
     if not images and not videos:
         below = "" if recursive else " Pass recursive=true to search subfolders."
         raise DataError(f"input: no image or video in '{spec}' ({', '.join(SUFFIXES + VIDEO_SUFFIXES)}).{below}")
@@ -60,4 +77,23 @@ def find_inputs(spec: str, *, recursive: bool) -> Inputs:
     for file, stem in stems.items():
         if times[stem] > 1:  # two that differ only in the ending, which becomes part of the name
             stems[file] = stem.with_name(file.name.replace(".", "_"))
-    return Inputs([Item(file, stems[file]) for file in images], [Item(file, stems[file]) for file in videos])
+    photos, films = ([Item(file, stems[file]) for file in found] for found in (images, videos))
+    return Inputs(photos, films, left_out=tuple(left_out))
+
+
+def _is_result(file: Path, root: Path, output: Path | None) -> bool:
+    """Whether a file is below the output folder, or has the name of a result where a prediction was recorded."""
+    if output is not None and output.resolve() in file.resolve().parents and root.resolve() in output.resolve().parents:
+        return True
+    above = itertools.takewhile(lambda folder: folder != root.parent, file.parents)
+    return bool(_RESULT.fullmatch(file.name)) and any((folder / "predictions.json").is_file() for folder in above)
+
+
+def _is_photo(file: Path) -> bool:
+    suffix = file.suffix.lower()
+    return suffix in (*SUFFIXES, *UNREAD_SUFFIXES) or (not suffix and is_image(file))
+
+
+def _names(files: list[Path]) -> str:
+    shown = ", ".join(file.name for file in files[:5])
+    return f"{len(files)} ({shown}{', ...' if len(files) > 5 else ''})"

@@ -24,8 +24,9 @@ from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import PRECISIONS
 from hudepth.runs.checkpoint import load_checkpoint
 
-Picture = str | Path | bytes | NDArray[Any] | Image.Image
-"""An image: a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), or a Pillow image."""
+Picture = str | Path | bytes | NDArray[Any] | torch.Tensor | Image.Image
+"""An image: a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), a tensor of such numbers, with
+the channels first or last, or a Pillow image."""
 
 
 class Prepared(NamedTuple):
@@ -62,6 +63,12 @@ class DepthModel:
         """Decode an image and resize it to the network's input; raises DataError if it cannot be read."""
         if isinstance(image, Image.Image):
             image = np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
+        if isinstance(image, torch.Tensor):
+            image = image.detach().cpu().numpy()
+            if image.ndim == 3 and image.shape[0] in (1, 3, 4) and image.shape[2] not in (1, 3, 4):
+                image = np.moveaxis(image, 0, 2)
+        if not isinstance(image, str | Path | bytes | np.ndarray):
+            raise TypeError(f"image: {type(image).__name__}. Pass a path, bytes, array, tensor or Pillow image.")
         photo = Photo(as_rgb(image), ()) if isinstance(image, np.ndarray) else read_photo(image)
         return Prepared(photo, fit_image(photo.rgb, self.info.size, fit=self.fit, aspect=self.info.aspect))
 

@@ -25,7 +25,7 @@ class Tally:
     """The results of a stream."""
 
     done: int = 0
-    failed: dict[str, str] = field(default_factory=dict)  # images that could not be read, and why
+    failed: dict[str, str] = field(default_factory=dict)  # inputs that could not be read or written, and why
     notes: dict[str, str] = field(default_factory=dict)  # remarks on images that were predicted
 
 

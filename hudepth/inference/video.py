@@ -27,7 +27,7 @@ class FrameReader:
     def __init__(self, source: Path | int) -> None:
         self.name = f"camera {source}" if isinstance(source, int) else f"'{source}'"
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # its warnings become errors below
-        self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
+        self._capture = cv2.VideoCapture(source if isinstance(source, int) else _utf8(source))
         if not self._capture.isOpened():
             self._capture.release()
             fix = "It is not a video or is cut off before its index; convert it to .mp4."
@@ -62,6 +62,14 @@ class FrameReader:
         self._capture.release()
 
 
+def _utf8(path: Path) -> str:
+    """Return a path as OpenCV takes it; raises DataError if its name is not UTF-8."""
+    try:
+        return str(path).encode().decode()
+    except UnicodeEncodeError:
+        raise DataError(f"{str(path)!a}: videos need names in UTF-8. Rename it.") from None
+
+
 class VideoWriter:
     """An ``.mp4`` that appears when the block ends, with all frames written so far, even after an error."""
 
@@ -82,7 +90,7 @@ class VideoWriter:
         even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
         if self._writer is None:
             size = (even.shape[1], even.shape[0])
-            self._writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*CODEC), self._rate, size)
+            self._writer = cv2.VideoWriter(_utf8(self._part), cv2.VideoWriter.fourcc(*CODEC), self._rate, size)
             if not self._writer.isOpened():
                 raise DataError(f"'{self.path}': cannot write a video of {size[0]} x {size[1]} there.")
         self._writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))

@@ -48,7 +48,7 @@ def point_cloud(
     ``depth_m`` is measured along the optical axis; the intrinsics, in its pixels, are by default those of NYU, scaled.
     """
     height, width = depth_m.shape
-    camera = intrinsics or Intrinsics.of_nyu(height, width)
+    camera = intrinsics or Intrinsics.of_photo(height, width)
     x = (np.arange(width, dtype=np.float32) - camera.cx) / camera.fx
     y = (np.arange(height, dtype=np.float32) - camera.cy) / camera.fy
     points = np.stack(np.broadcast_arrays(depth_m * x, depth_m * y[:, None], depth_m), axis=-1).reshape(-1, 3)

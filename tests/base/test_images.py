@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, features
 
 from hudepth.base.errors import DataError
 from hudepth.base.images import as_rgb, read_photo
@@ -93,7 +93,7 @@ JPEG = encoded(Image.fromarray(np.tile(RGB, (10, 10, 1))), "JPEG")
     ("data", "message"),
     [
         (b"", "x.png: the file is empty (0 bytes). Copy it again."),
-        (b"hello, I am a text", "x.png: no image that can be read. Pass a JPEG, PNG, WEBP, BMP, TIFF, GIF, PPM."),
+        (b"hello, I am a text", "x.png: no image that can be read. Pass a JPEG, PNG, WEBP, BMP, TIFF, GIF, PPM"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "x.png: no image that can be read"),
         (JPEG[: len(JPEG) // 2], "x.png: cannot be decoded, the file is truncated or damaged ("),
         (JPEG[:60], "x.png: "),
@@ -127,3 +127,36 @@ def test_a_file_that_is_not_there() -> None:
 def test_arrays_that_are_no_image(array: np.ndarray) -> None:
     with pytest.raises(DataError, match=r"image: an array of .* and shape .* Pass RGB as uint8"):
         as_rgb(array)
+
+
+def tagged(tags: int, length: int, *, orientation: int = 6) -> bytes:
+    """An EXIF block whose tags all lie over the same ``length`` bytes."""
+    entries = struct.pack("<HHII", 0x0112, 3, 1, orientation)
+    entries += b"".join(struct.pack("<HHII", 0x9000 + n, 7, length, 100) for n in range(tags))
+    return b"II*\0" + struct.pack("<IH", 8, tags + 1) + entries + bytes(max(length, 20))
+
+
+def jpeg_with(*blocks: bytes) -> bytes:
+    segments = [b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block for block in blocks]
+    return JPEG[:2] + b"".join(segments) + JPEG[2:]
+
+
+def test_one_tag_is_read_of_exif() -> None:
+    assert read_photo(jpeg_with(tagged(2, 8))).rgb.shape == (200, 120, 3)
+    assert read_photo(jpeg_with(b"MM\0*" + bytes(3))).rgb.shape == (120, 200, 3)
+    assert read_photo(jpeg_with(tagged(1, 8, orientation=77))).rgb.shape == (120, 200, 3)
+
+
+@pytest.mark.parametrize(
+    "data", [jpeg_with(tagged(3000, 20_000)), jpeg_with(*[tagged(0, 60_000)] * 30), tagged(5000, 10_000_000)]
+)
+def test_tags_cannot_fill_the_memory(data: bytes) -> None:
+    with pytest.raises(DataError, match=r"x\.jpg: .*EXIF"):
+        read_photo(data, where="x.jpg")
+
+
+def test_avif_is_read_and_heic_is_named() -> None:
+    if features.check("avif"):
+        assert read_photo(encoded(Image.fromarray(RGB), "AVIF")).rgb.shape == RGB.shape
+    with pytest.raises(DataError, match=r"x\.heic: HEIC"):
+        read_photo(b"\0\0\0\x18ftypheic" + bytes(40), where="x.heic")

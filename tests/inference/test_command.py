@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -90,6 +92,53 @@ def test_what_is_bad_is_listed_and_the_rest_is_done(tiny: Path, photos: Path, co
     assert set(json.loads(Path("out/predictions.json").read_text())["failed"]) == {
         f"photos/{name}" for name in ("empty.png", "cut.png", "text.jpg", "cut.avi")
     }
+
+
+def test_what_cannot_be_written_is_named_and_the_rest_is_done(tiny: Path, photos: Path, command: Command) -> None:
+    Image.fromarray(np.zeros((1, 60_000, 3), np.uint8)).save(photos / "line.png")
+    for name in ("walk.avi", "run.avi"):
+        film(photos / name, 5)
+    Path("out/walk_depth.mp4").mkdir(parents=True)
+    Path("out/wide_side.jpg").mkdir()
+    done = command("predict", f"checkpoint={tiny}", "input=photos", "formats=[npy,side,colour]", "output=out")
+    assert done.code == 1
+    assert set(json.loads(Path("out/predictions.json").read_text())["failed"]) == {
+        f"photos/{name}" for name in ("line.png", "wide.webp", "walk.avi")
+    }
+    assert "line.png': no side: a JPEG of" in done.err
+    assert "walk.avi': its results cannot be written" in done.err
+    assert Path("out/line_depth.npy").exists()
+    assert Path("out/run_depth.mp4").exists()
+    assert "Traceback" not in done.err
+
+
+def test_a_camera_in_millimetres_is_refused(tiny: Path, photos: Path, command: Command) -> None:
+    camera = "intrinsics=[4.2,4.2,2,3]"
+    done = command("predict", f"checkpoint={tiny}", "input=photos/a.png", "formats=[ply]", camera, "output=out")
+    assert done.code == 1
+    assert re.search("intrinsics: .* 64 x 48.* pixels", done.err)
+    assert not list(Path("out").glob("*.ply"))
+
+
+def test_a_second_run_does_not_read_the_first_ones_results(tiny: Path, photos: Path, command: Command) -> None:
+    for output in ("predictions", "predictions", "other"):
+        done = command("predict", f"checkpoint={tiny}", "input=.", "recursive=true", f"output={output}")
+        assert done.code == 0, done.err
+        assert "3 predicted in" in done.err
+    assert "results of hudepth-predict" in done.err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux only")
+def test_names_that_are_not_utf8(tiny: Path, photos: Path, command: Command) -> None:
+    name = os.fsdecode(b"caf\xe9")
+    (photos / "a.png").rename(photos / f"{name}.png")
+    film(photos / "b.avi", 5)
+    (photos / "b.avi").rename(photos / f"{name}.avi")
+    done = command("predict", f"checkpoint={tiny}", "input=photos", "output=out")
+    assert done.code == 1
+    assert r"caf\udce9.avi': videos need names in UTF-8" in done.err
+    assert (Path("out") / f"{name}_png_depth.npy").exists()
+    assert json.loads(Path("out/predictions.json").read_text())["predicted"] == 3
 
 
 def test_a_video_becomes_a_video(tiny: Path, tmp_path: Path, command: Command) -> None:

@@ -36,7 +36,7 @@ def test_a_pattern_a_file_and_a_camera(folder: Path) -> None:
     assert names(folder, f"{folder}/**/*.webp") == (["sub/c"], [])
     assert names(folder, str(folder / "walk.mp4")) == ([], ["walk"])
     assert names(folder, str(folder / "notes.txt")) == (["notes"], [])  # whoever names a file means it
-    assert find_inputs("2", recursive=False) == ([], [], 2)
+    assert find_inputs("2", recursive=False).camera == 2
 
 
 def test_a_folder_whose_name_is_a_number(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,6 +44,29 @@ def test_a_folder_whose_name_is_a_number(folder: Path, monkeypatch: pytest.Monke
     (folder / "7").mkdir()
     (folder / "7" / "x.jpg").write_bytes(b"")
     assert names(folder, "7") == (["x"], [])
+
+
+def test_results_are_no_inputs(folder: Path) -> None:
+    for name in ("out/x.jpg", "old/a_depth.png", "old/predictions.json", "old/walk/000000_depth.jpg", "my_side.jpg"):
+        (folder / name).parent.mkdir(exist_ok=True, parents=True)
+        (folder / name).write_bytes(b"")
+    found = find_inputs(str(folder), recursive=True, output=folder / "out")
+    assert [str(item.stem) for item in found.images if item.stem.parts[0] in ("out", "old", "my_side")] == ["my_side"]
+    line = next(line for line in found.left_out if "results" in line)
+    assert ": 3 (" in line
+    assert "x.jpg" in line
+
+
+def test_photographs_by_phones_and_what_is_left_out(folder: Path) -> None:
+    for name in ("p.HEIC", "p.avif", "p.jfif", "p.MTS", "bare"):
+        (folder / name).write_bytes(b"\xff\xd8\xff\xe0" if name == "bare" else b"")
+    (folder / "Makefile").write_bytes(b"all:")
+    found = find_inputs(str(folder), recursive=False)
+    images = {item.path.name for item in found.images}
+    assert {"p.HEIC", "p.avif", "p.jfif", "bare"} <= images
+    assert "p.MTS" in {item.path.name for item in found.videos}
+    (line,) = found.left_out
+    assert "2 (Makefile, notes.txt)" in line
 
 
 def test_nothing(folder: Path) -> None:

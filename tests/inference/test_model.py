@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 import hudepth
-from hudepth.base.errors import CheckpointError
+from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
 
@@ -47,3 +48,18 @@ def test_a_missing_bundled_model_is_an_error(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("hudepth.runs.bundles.find_spec", lambda _: None)
     with pytest.raises(CheckpointError, match=r"checkpoint: .*'nyu'"):
         hudepth.load("nyu")
+
+
+def test_tensors_are_pictures_and_lists_are_cameras(grey: DepthModel) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    depth = grey.predict(rgb)
+    for tensor in (torch.from_numpy(rgb), torch.from_numpy(rgb).permute(2, 0, 1)):
+        np.testing.assert_array_equal(grey.predict(tensor).metres, depth.metres)
+    given = depth.point_cloud((60.0, 61.0, 32.0, 24.0)).points_m
+    matrix = np.array([[60, 0, 32], [0, 61, 24], [0, 0, 1]])
+    for camera in ([60.0, 61.0, 32.0, 24.0], np.array([60, 61, 32, 24]), matrix):
+        np.testing.assert_array_equal(depth.point_cloud(camera).points_m, given)
+    with pytest.raises(TypeError, match=r"intrinsics: .*list"):
+        depth.point_cloud([60.0, 61.0])
+    with pytest.raises(ConfigError, match=r"intrinsics: .*64 x 48"):
+        depth.point_cloud([4.2, 4.2, 2.0, 3.0])
