@@ -91,7 +91,8 @@ def test_refusals(tmp_path: Path) -> None:
     write(tmp_path / "b", "00005")
     (tmp_path / "b/rgb_00005.jpg").unlink()
     assert refusal(NyuRawSource(tmp_path)) == (
-        f"data.root: 1 of 2 depth maps in '{tmp_path}' have no image, the first is 'b/sync_depth_00005.png'. {EXPECTED} {SKIP}"
+        f"data.root: 1 of 2 depth maps in '{tmp_path}' have no image, the first is 'b/sync_depth_00005.png'. "
+        f"{EXPECTED} {SKIP}"
     )
     (tmp_path / "a/rgb_00000.png").touch()
     assert refusal(NyuRawSource(tmp_path)) == (
