@@ -16,7 +16,6 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, DistributedSampler
 
 from hudepth.base.console import log
-from hudepth.base.errors import DataError
 from hudepth.base.options import Range, Size, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
@@ -88,8 +87,6 @@ class DepthDataModule(LightningDataModule):
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
         self.cache = Path(cache)
-        if self.on_error == "skip":
-            source.unpaired = []
         self._draws: tuple[int, torch.Generator] | None = None
 
     @cached_property
@@ -121,20 +118,21 @@ class DepthDataModule(LightningDataModule):
             log.log(level, text, 100 * beyond, self.max_depth_m, fix if beyond > 0.5 else "")
 
     def train_dataloader(self) -> DataLoader[RawBatch]:
-        """Shuffled training batches; the last, shorter one is kept. DataError if there are no training pairs."""
-        if not (self.split.train and self.split.val):
-            raise DataError(
-                f"data.split={self.split.kind}: all pairs are test, none train or validate. Pass another data.split."
-            )
+        """Shuffled training batches; the last, shorter one is kept."""
         rank, world_size = self._shard()
         dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
-        # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees the same order.
+        sampler: DistributedSampler[RawBatch] | BlockShuffle
         if self.shuffle_block is None:
-            return self._loader(dataset, DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed))
-        sampler = BlockShuffle(
-            dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
-            read_ahead=self.store.read_ahead,
-        )  # fmt: skip
+            sampler = DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed)
+        else:
+            sampler = BlockShuffle(
+                dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
+                read_ahead=self.store.read_ahead,
+            )  # fmt: skip
+        if self.trainer is not None:
+            # The order depends on seed and epoch alone, so a resumed run sees the same. Lightning sets the epoch of a
+            # resumed run's first loader only once its processes have begun to read.
+            sampler.set_epoch(self.trainer.fit_loop.epoch_progress.current.processed)  # type: ignore[attr-defined]
         return self._loader(dataset, sampler)
 
     def val_dataloader(self) -> DataLoader[RawBatch]:
