@@ -125,6 +125,8 @@ class ResNet18Encoder(Encoder):
         without_layer4 = not any(name.startswith(LAYER4) for name in state)
         if without_layer4:
             state |= {name: value for name, value in own.items() if name.startswith(LAYER4)}
+        # torchvision's first files lack the counters of batch norm, which only matter without a momentum
+        state = {name: value for name, value in own.items() if name.endswith("num_batches_tracked")} | state
         misshapen = {name for name in own.keys() & state.keys() if own[name].shape != state[name].shape}
         for problem, names in (
             ("missing", own.keys() - state.keys()),
@@ -154,6 +156,15 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
         raise CheckpointError(
             f"model.weights: '{path}' is not a file of plain tensors ({type(error).__name__}). {_FIX}"
         ) from error
+    if isinstance(state, dict) and isinstance(inner := state.get("state_dict"), dict):
+        log.info("model.weights: '%s' is a checkpoint; its state_dict is read", path)
+        state = inner
+    for wrapper in ("module.", "_orig_mod."):  # of DataParallel and torch.compile
+        if isinstance(state, dict) and state and all(str(name).startswith(wrapper) for name in state):
+            log.info(
+                "model.weights: '%s' was saved from a wrapped network; '%s' is removed from its names", path, wrapper
+            )
+            state = {str(name).removeprefix(wrapper): value for name, value in state.items()}
     if not (isinstance(state, dict) and all(isinstance(n, str) and isinstance(v, Tensor) for n, v in state.items())):
         raise CheckpointError(f"model.weights: '{path}' does not contain a state_dict. {_FIX}")
     return cast("dict[str, Tensor]", state)
