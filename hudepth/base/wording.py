@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 import sys
 from collections.abc import Iterator
@@ -16,16 +14,6 @@ LAUNCHERS = {
     "joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "submitit": "slurm", "ray": "ray",
 }  # fmt: skip
 """Ways to run the jobs of a sweep, and the extra of this package that installs each."""
-
-_FOLDER = "Pass a folder that you can write to."
-_FIXES = {
-    errno.ENOSPC: "Free some space, or pass a folder on another disk.",
-    errno.EDQUOT: "Free some of your quota, or pass a folder on another disk.",
-    errno.EFBIG: "Raise the limit of file sizes (ulimit -f), or pass a folder on another disk.",
-    errno.EROFS: _FOLDER, errno.EACCES: _FOLDER, errno.EPERM: _FOLDER, errno.ENOTDIR: _FOLDER,
-    errno.EIO: "Check the disk.",
-}  # fmt: skip
-"""What to do about a file that could not be written, by the system's number of the error."""
 
 
 def one_line(error: BaseException, task: str) -> str:
@@ -42,17 +30,15 @@ def one_line(error: BaseException, task: str) -> str:
     for cause in chain:
         if line := _config_line(cause, task):
             return line
-    for cause in chain:
-        if isinstance(cause, OSError) and cause.errno in _FIXES:
-            name = f"'{cause.filename}'" if cause.filename else "a file"
-            return f"{name} cannot be written ({os.strerror(cause.errno)}). {_FIXES[cause.errno]}"
     message = " ".join(str(error).split()) or type(error).__name__
     return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
+    seen: set[int] = set()  # an error that is raised again and again can be part of its own context
+    while error is not None and id(error) not in seen:
         yield error
+        seen.add(id(error))
         error = error.__cause__ or error.__context__
 
 

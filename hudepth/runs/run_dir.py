@@ -13,9 +13,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ import yaml
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import read_json, read_text, write_json, write_text
+from hudepth.base.files import write_json, write_text
 
 SCORED = "scored.json"
 
@@ -62,11 +64,10 @@ def write_resumed(run: Path, *, config: Mapping[str, Any], overrides: Sequence[s
     """Write config.yaml again and append to overrides.txt. Raises ConfigError if the folder cannot be written."""
     file = run / "overrides.txt"
     try:
-        earlier = read_text(file).splitlines() if file.is_file() else []
+        earlier = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
         _write_config(run, config, [*earlier, *overrides])
-    except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise ConfigError(f"'{run}' cannot be written ({why}), so the run cannot be resumed.") from error
+    except OSError as error:
+        raise ConfigError(f"'{run}' cannot be written ({error.strerror}), so the run cannot be resumed.") from error
 
 
 def _write_config(run: Path, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
@@ -74,10 +75,24 @@ def _write_config(run: Path, config: Mapping[str, Any], overrides: Sequence[str]
     write_text(run / "overrides.txt", "".join(f"{line}\n" for line in overrides))
 
 
+class _LogFile(logging.FileHandler):
+    """A log file that gives up at the first line it cannot write: on a full disk, say."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Warn once."""
+        self.setLevel(logging.CRITICAL + 1)
+        log.warning("'%s' cannot be written (%s)", self.baseFilename, sys.exception())
+
+    def close(self) -> None:
+        """Close the file, whether or not its last lines can be written."""
+        with suppress(OSError):
+            super().close()
+
+
 @contextmanager
 def log_to_file(path: Path) -> Iterator[None]:
     """Also write hudepth's and Lightning's log lines to a file during the block."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     loggers = [log, logging.getLogger("lightning.pytorch")]
     for logger in loggers:
@@ -106,9 +121,8 @@ def note_scored(run: Path, *, epoch: int, data: str, split: str, protocols: Sequ
 def read_scored(run: Path) -> list[dict[str, Any]]:
     """Return the recorded evaluations of a run on test images; empty if scored.json is missing or damaged."""
     try:
-        entries = read_json(run / SCORED)
+        entries = json.loads((run / SCORED).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
     keys = {"time", "epoch", "data", "split", "protocols"}
-    whole = [e for e in entries if isinstance(e, dict) and keys <= e.keys()] if isinstance(entries, list) else []
-    return [e for e in whole if isinstance(e["epoch"], int) and not isinstance(e["epoch"], bool)]
+    return [e for e in entries if isinstance(e, dict) and keys <= e.keys()] if isinstance(entries, list) else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from filelock import FileLock, Timeout
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import read_json, remove_leftovers, write_json
+from hudepth.base.files import write_json
 
 FINISHED, FAILED, PRUNED, INTERRUPTED, RUNNING = "finished", "failed", "pruned", "interrupted", "running"
 LOCK = ".lock"
@@ -28,14 +29,23 @@ def write_status(run: Path, state: str, **more: Any) -> None:
     """Write status.json: a state such as ``finished``, the time, and ``more``; numbers that are not finite as null."""
     more = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in more.items()}
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    write_json(run / "status.json", {"state": state, "time": now, "pid": os.getpid(), **more})
+    status = {"state": state, "time": now, "pid": os.getpid(), **more}
+    file = run / "status.json"
+    try:
+        write_json(file, status)
+    except OSError:
+        if not file.is_file():
+            raise
+        with file.open("r+", encoding="utf-8") as old:  # a full disk has no room for a new file, but that of the old
+            old.write(json.dumps(status))
+            old.truncate()
 
 
 def read_status(run: Path) -> dict[str, Any]:
     """Read status.json as it is; empty if it is missing or damaged."""
     try:
-        status = read_json(run / "status.json")
-    except (OSError, ValueError):
+        status = json.loads((run / "status.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return {}
     return status if isinstance(status, dict) else {}
 
@@ -82,7 +92,6 @@ def lock_run(run: Path, *, timeout_s: float = 0) -> Iterator[None]:
     except OSError as error:
         raise ConfigError(f"'{run}' cannot be written ({error.strerror}). Pass a folder you can write to.") from error
     try:
-        remove_leftovers(run)
         yield
     finally:
         lock.release()

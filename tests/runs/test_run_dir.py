@@ -99,3 +99,14 @@ def test_log_lines_go_to_the_file_while_it_lasts(tmp_path: Path) -> None:
         log.setLevel(level)
     lines = (tmp_path / "train.log").read_text(encoding="utf-8").splitlines()
     assert [line.split(" ", 2)[2] for line in lines] == ["INFO epoch 1 of größe", "WARNING careful"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_log_file_on_a_full_disk_gives_up_with_one_warning(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "train.log").symlink_to("/dev/full")
+    with run_dir.log_to_file(tmp_path / "train.log"):
+        for _ in range(3):
+            log.warning("a line")
+    assert "Traceback" not in capsys.readouterr().err

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from hudepth.runs import status
 from hudepth.runs.status import LockedError, lock_run, read_state, read_status, write_status
 
 
@@ -48,3 +49,18 @@ def test_the_error_of_a_failed_run(tmp_path: Path) -> None:
     write_status(tmp_path, "failed", error="no memory")
     assert read_state(tmp_path) == ("failed", "no memory")
     assert [file.name for file in tmp_path.iterdir()] == ["status.json"]  # looking leaves nothing behind
+
+
+def test_the_status_of_a_run_on_a_full_disk_is_written_over_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_status(tmp_path, "running", note="long enough to be longer than what follows")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(status, "write_json", full)
+    write_status(tmp_path, "failed")
+    assert read_status(tmp_path)["state"] == "failed"
+    with pytest.raises(OSError, match="No space"):
+        write_status(tmp_path / "new", "running")
