@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import re
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -12,11 +13,18 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.options import plain
-from hudepth.base.verbs import SUBCOMMANDS, commands, module_of
+from hudepth.base.verbs import SUBCOMMANDS, commands, module_of, options_of
 from hudepth.base.wording import LAUNCHERS, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
 """Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
+
+PATHS = {
+    "input", "output", "checkpoint", "resume", "init", "run", "runs", "dir", "a", "b", "name", "images", "sweep_dir",
+    "model.weights", "distill.teacher", "data.root", "data.cache", "data.teacher", "data.source.images",
+    "data.source.depths", "data.source.manifest", "paths.runs", "paths.sweeps", "paths.cache",
+}  # fmt: skip
+"""Options that are paths or names: their values are text, whatever Hydra's grammar would make of them."""
 
 
 def _main(task: str) -> int:
@@ -35,7 +43,7 @@ def _main(task: str) -> int:
     debug = [argument for argument in arguments if argument in ("debug=true", "debug=false")]
     try:
         sys.argv[1:] = rewrite(task, [argument for argument in arguments if argument not in debug])
-        _check_launcher(sys.argv[1:])
+        _check_groups(sys.argv[1:])
         return _run_hydra(task)
     except KeyboardInterrupt:
         return 130
@@ -59,7 +67,7 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     """Turn what people type into what Hydra expects.
 
     ``experiment=x`` becomes ``+experiment=x``; ``hudepth-data prepare`` becomes ``verb=prepare``; where the rest of
-    ``data`` is in a checkpoint, a ``data.root=x`` without ``data=`` becomes ``++data.root=x``.
+    ``data`` is in a checkpoint, a ``data.root=x`` without ``data=`` becomes ``++data.root=x``. Paths are quoted.
 
     Args:
         task: the word after ``hudepth-``.
@@ -68,6 +76,8 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     Raises:
         ConfigError: if ``hudepth-data`` or ``hudepth-report`` is given no verb.
     """
+    multirun = any(a in ("-m", "--multirun") for a in arguments)
+    arguments = [_quote_path(argument, multirun=multirun) for argument in arguments]
     result = [f"+{a}" if a.startswith(tuple(f"{g}=" for g in ADDED_GROUPS)) else a for a in arguments]
     if task in SUBCOMMANDS and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
         verbs = [a for a in result if a in SUBCOMMANDS[task]]
@@ -80,19 +90,42 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     result = [*flags, *(a for a in result if a not in flags)]  # between overrides argparse would stumble over them
     if any(a.startswith("resume=") for a in result):  # the keys are those of the run, which Hydra does not know
         result = [f"++{a}" if "." in a.partition("=")[0] and a[0] not in "+~" else a for a in result]
-    if task in ("test", "report", "export", "bench") and not any(a.startswith(("data=", "+data=")) for a in result):
+    if task in ("test", "report", "export") and not any(a.startswith(("data=", "+data=")) for a in result):
         result = [f"++{a}" if a.startswith("data.") else a for a in result]
     return result
 
 
-def _check_launcher(arguments: list[str]) -> None:
-    """Refuse a launcher whose package is not installed: Hydra would blame whatever has a comma in it.
+def _quote_path(argument: str, *, multirun: bool) -> str:
+    """Quote the path in ``key=path``: to Hydra, ``2011_09_26`` is a number, and ``a=b`` or ``x (1)`` are mistakes.
+
+    Lists, quoted values, interpolations, and in a multirun values with a comma stay as they are, unless they exist.
+    """
+    key, separator, value = argument.partition("=")
+    if not separator or key.lstrip("+~") not in PATHS or "${" in value:
+        return argument
+    constant = value.lower() in ("", "null", "true", "false")
+    meant = constant or re.fullmatch(r"'.*'|\".*\"|\[.*\]", value) or (multirun and "," in value)
+    word = re.fullmatch(r"[A-Za-z/.][\w/.-]*", value, re.ASCII) and not constant and value.lower() not in ("nan", "inf")
+    if word or (meant and not os.path.lexists(value)):
+        return argument
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + found[2].replace("'", "\\'"), value)
+    return f"{key}='{escaped}'"
+
+
+def _check_groups(arguments: list[str]) -> None:
+    """Refuse what Hydra would misread: several choices of a group, of which it would take parts of each.
 
     Raises:
-        ConfigError: if it is not.
+        ConfigError: for these, and for a launcher whose package is missing: Hydra blames whatever has a comma in it.
     """
     for argument in arguments:
         group, _, name = argument.partition("=")
+        if name.startswith("[") and group != "protocol" and group.lstrip("+") not in ADDED_GROUPS and options_of(group):
+            choices = name.strip("[]")
+            one = choices.partition(",")[0].strip()
+            raise ConfigError(
+                f"{group}: takes one choice, not {name}. Pass {group}={one}, or sweep: -m {group}={choices}."
+            )
         if group == "hydra/launcher" and name in LAUNCHERS:
             package = f"hydra_plugins.hydra_{name.partition('_')[0]}_launcher"
             if importlib.util.find_spec(package) is None:

@@ -5,10 +5,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from hudepth import cli
 from hudepth.base import wording
 from hudepth.base.errors import ConfigError
+from tests.commands import Command
 
 BIN = Path(sys.executable).parent
 
@@ -119,6 +121,33 @@ def test_tab_completion(tmp_path: Path) -> None:
 )
 def test_rewrite(task: str, typed: list[str], rewritten: list[str]) -> None:
     assert cli.rewrite(task, typed) == rewritten
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "2011_09_26", "20240501_123456", "0", "1e5", "nan", "a=b", "a,b", "x (1)", "it's", "back\\", "a\\'b", "{x}",
+        "x:y", "ü/é", "~/x", "*.png", "C:\\new",
+    ],
+)  # fmt: skip
+def test_a_path_is_taken_as_it_is_typed(path: str) -> None:
+    (rewritten,) = cli.rewrite("predict", [f"input={path}"])
+    (override,) = OverridesParser.create().parse_overrides([rewritten])
+    assert override.value() == path
+    assert cli.rewrite("predict", ["threads=2", "scale_m=[0,5]"]) == ["threads=2", "scale_m=[0,5]"]
+
+
+def test_lists_quotes_interpolations_and_sweeps_of_paths_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    typed = ["runs=[a,b]", "output='x'", "dir=${name}", "output=null", "images=true"]
+    assert [cli.rewrite("data", ["verb=info", each])[1] for each in typed] == typed
+    assert cli.rewrite("train", ["-m", "data.root=a,b"]) == ["-m", "data.root=a,b"]
+    (tmp_path / "[1]").mkdir()
+    assert cli.rewrite("predict", ["input=[1]"]) == ["input='[1]'"]
+
+
+def test_several_choices_of_a_group_are_refused(command: Command) -> None:
+    assert "hudepth-train: loss: takes one choice" in command("train", "loss=[l1,silog]").err
 
 
 def test_rewrite_refuses_an_unknown_verb() -> None:

@@ -23,6 +23,9 @@ GPUS = {
 """Accelerators that a machine may lack, and their implementations."""
 
 
+_SET_HERE = {"logger", "callbacks", "plugins", "default_root_dir", "use_distributed_sampler"}
+
+
 def check_devices(options: Mapping[str, Any]) -> None:
     """Check that the requested devices exist, before anything is prepared or written.
 
@@ -32,6 +35,8 @@ def check_devices(options: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: for a GPU where there is none, or synchronised batch norm without one.
     """
+    if taken := sorted(_SET_HERE & options.keys()):
+        raise ConfigError(f"trainer.{taken[0]} is set by hudepth. See logger= and callbacks= for your own.")
     accelerator = str(options.get("accelerator", "auto"))
     if accelerator in GPUS and not any(kind.is_available() for kind in GPUS[accelerator]):
         several = str(options.get("devices", 1)) != "1"

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from hudepth.base.errors import ConfigError, DataError, did_you_mean
-from hudepth.base.files import read_json, write_json
+from hudepth.base.files import write_json
 from hudepth.data.sources.base import Record
 
 SUBSETS = ("train", "val", "test")
@@ -55,8 +55,7 @@ def make_split(
     Args:
         records: all pairs of a store.
         kind: ``random`` (the paper: frames at random), ``scene`` (no scene in two subsets), or ``official`` (the
-            set's own test and val pairs; without val pairs, validation is taken by scene from its training pairs), or
-            ``test`` (all pairs are test). If all pairs are test, also by ``fractions``, train and val may be empty.
+            set's own test pairs; validation taken by scene from its training pairs).
         seed: of the permutation of frames or scenes.
         fractions: of train, val and test; they sum to 1. ``official`` uses only the ratio of the first two.
 
@@ -65,7 +64,7 @@ def make_split(
     check_split(kind, fractions)
     subsets = dict(zip(SUBSETS, _KINDS[kind](records, seed, fractions), strict=True))
     for name, indices in subsets.items():
-        if not indices and (name == "test" or len(subsets["test"]) < len(records) or not records):
+        if not indices:
             raise DataError(
                 f"data.split={kind}: the {name} subset is empty ({len(records)} pairs, "
                 f"{len({r.scene for r in records})} scenes, fractions {list(fractions)}). "
@@ -117,14 +116,12 @@ def _by_scene(
 
 
 def _official(records: Sequence[Record], seed: int, fractions: Sequence[float]) -> tuple[list[int], ...]:
-    own_train, val, test = ([i for i, record in enumerate(records) if record.split == name] for name in SUBSETS)
-    if unknown := len(records) - len(own_train) - len(val) - len(test):
+    if unknown := sum(record.split not in ("train", "test") for record in records):
         raise DataError(
             f"data.split=official: {unknown} of {len(records)} pairs are in neither 'train' nor 'test' of the set's "
             "own split. Pass data.split=scene or data.split=random."
         )
-    if val:
-        return own_train, val, test
+    own_train, test = ([i for i, record in enumerate(records) if record.split == name] for name in ("train", "test"))
     share = fractions[0] + fractions[1]
     if not own_train or not share:
         return [], [], test
@@ -135,7 +132,6 @@ _KINDS: Mapping[str, Callable[[Sequence[Record], int, Sequence[float]], tuple[li
     "random": _random,
     "scene": lambda records, seed, fractions: _by_scene(records, range(len(records)), seed, fractions),
     "official": _official,
-    "test": lambda records, seed, fractions: ([], [], list(range(len(records)))),
 }
 
 
@@ -154,11 +150,11 @@ def load_split(path: Path, records: Sequence[Record]) -> Split:
     Raises DataError if the file is damaged, its hash does not fit its ids, or a pair it names is not there.
     """
     try:
-        saved = read_json(path)
+        saved = json.loads(path.read_text(encoding="utf-8"))
         ids: dict[str, list[str]] = {name: [str(i) for i in saved["ids"][name]] for name in SUBSETS}
         kind, seed, sha256 = str(saved["kind"]), int(saved["seed"]), str(saved["sha256"])
         train, val, test = (float(share) for share in saved["fractions"])
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"'{path}' is not a split.json ({type(error).__name__}: {error}).") from error
     if _hash(ids) != sha256:
         raise DataError(f"'{path}': its ids do not have the hash it states; it was edited. Restore it, or train again.")

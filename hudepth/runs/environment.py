@@ -16,6 +16,7 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
     """Return what it takes to repeat a run: versions, git state, device, threads, seed, command."""
     import torch
 
+    uses_gpu = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -23,7 +24,7 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
         "packages": {**{name: _version(name) for name in PACKAGES}, "torch": str(torch.__version__)},
         "git": _git(),
         "accelerator": accelerator,
-        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else _processor(),
+        "device": torch.cuda.get_device_name() if uses_gpu else _processor(),
         "threads": torch.get_num_threads(),
         "seed": seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],

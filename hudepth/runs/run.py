@@ -14,7 +14,6 @@ from hudepth.base.files import read_yaml
 from hudepth.runs.history import read_history
 from hudepth.runs.identity import run_key
 from hudepth.runs.results import Result, find_result
-from hudepth.runs.sections import check_config
 from hudepth.runs.status import read_state
 
 CHECKPOINTS = "checkpoints"
@@ -42,7 +41,6 @@ class Run:
         if missing := [part for part in ("seed", "data", "model", "loss") if part not in config]:
             why = f"its config.yaml has no '{missing[0]}'"
             raise CheckpointError(f"'{path}' is not a run of hudepth-train: {why}. Pass a run directory.")
-        check_config(config, where=path / "config.yaml")
         return cls(path, config, *read_state(path), labels=dict(labels or {}))
 
     @property
@@ -90,7 +88,7 @@ def read_config(path: Path) -> dict[str, Any]:
 def newest_run(runs: str | Path) -> Path:
     """Return the run with a checkpoint below ``runs`` that was written to last. Raises CheckpointError if none is."""
     root = Path(runs).expanduser()
-    found = [c.parent.parent for name in (BEST, LAST) for c in root.glob(f"*/*/{CHECKPOINTS}/{name}")]
+    found = [c.parent.parent for name in (BEST, LAST) for c in root.glob(f"**/{CHECKPOINTS}/{name}")]
     if not found:
         fix = "Train one with hudepth-train, or pass checkpoint=<file or run directory>."
         raise CheckpointError(f"checkpoint=last: no run with a checkpoint below '{root}'. {fix}")

@@ -18,14 +18,15 @@ from hudepth.base.console import duration, log
 from hudepth.data.store import DepthStore
 from hudepth.evaluation.pictures import make_panels
 from hudepth.runs.history import write_history
+from hudepth.training.checkpointing import has_validated
+from hudepth.training.loggers import drop, is_dropped
 from hudepth.training.module import loss_name
 from hudepth.viz.panels import draw_panels, save_panels
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:
     """Return what was logged for the epoch that ends now, by name."""
-    # without a validation in this epoch, Lightning still has the values of an earlier one
-    validated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+    validated = has_validated(trainer)
     metrics = sorted(trainer.callback_metrics.items())
     return {name: value.item() for name, value in metrics if validated or not name.startswith("val/")}
 
@@ -144,6 +145,9 @@ class PanelPictures(Callback):
         panels = make_panels(pl_module, self.store, self.indices, max_depth_m=self.max_depth_m)
         save_panels(self.folder / f"epoch_{epoch:03d}.png", panels)
         for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                step = trainer.global_step
-                logger.experiment.add_image("val/panels", draw_panels(panels), step, dataformats="HWC")
+            if isinstance(logger, TensorBoardLogger) and not is_dropped(logger):
+                step, picture = trainer.global_step, draw_panels(panels)
+                try:
+                    logger.experiment.add_image("val/panels", picture, step, dataformats="HWC")
+                except OSError as error:
+                    drop(logger, error)

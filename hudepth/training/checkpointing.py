@@ -17,12 +17,17 @@ def at_full_size(trainer: Trainer) -> bool:
     return data is None or bool(data.train_size == data.size)
 
 
+def has_validated(trainer: Trainer) -> bool:
+    """Return whether the epoch that ends now was validated; if not, Lightning still has an earlier one's values."""
+    return (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+
+
 class FullSizeEarlyStopping(EarlyStopping):
-    """An EarlyStopping that counts epochs at full size only."""
+    """An EarlyStopping that counts epochs at full size only, and those with a new value of what it monitors."""
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count, and stop if it is time."""
-        if at_full_size(trainer):
+        if at_full_size(trainer) and (has_validated(trainer) or not self.monitor.startswith("val/")):
             super().on_train_epoch_end(trainer, pl_module)
 
 

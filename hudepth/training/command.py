@@ -25,7 +25,6 @@ from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.environment import environment
 from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
 from hudepth.runs.run import CHECKPOINTS, LAST, read_config
-from hudepth.runs.sections import check_config, check_resumable
 from hudepth.runs.status import lock_run, write_status
 from hudepth.training.fit import fit
 from hudepth.training.initial import Training
@@ -91,8 +90,7 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
     last = path / CHECKPOINTS / LAST
     if not last.is_file():
         raise CheckpointError(f"resume: '{path}' has no finished epoch to resume from. Train again without resume=.")
-    check_config(config, where=path / "config.yaml")
-    check_resumable(read_plain(last), where=last)
+    read_plain(last)
     epochs = config["trainer"].get("max_epochs")
     resumed = OmegaConf.create({**config, "trust": []})
     for override in overrides:
@@ -172,8 +170,8 @@ def _write_status(path: Path, state: str, **more: Any) -> None:
 
 def _write_failure(path: Path, message: str) -> None:
     try:
+        _write_status(path, "failed", error=message)
         with (path / "train.log").open("a", encoding="utf-8") as file:
             file.write(traceback.format_exc())
-        _write_status(path, "failed", error=message)
     except OSError:  # probably a full disk; the error itself still goes to the terminal
         log.warning("the status in '%s' could not be written", path)

@@ -28,6 +28,10 @@ class TrainerOptions:
     gradient_clip_val: Annotated[float, Range(0)] | None = None
 
     def __post_init__(self) -> None:
+        if self.precision.startswith("64"):
+            raise ConfigError(
+                f"trainer.precision: {self.precision} is not supported, images have 32 bits. Pass 32-true."
+            )
         if self.precision.endswith("16-true"):
             raise ConfigError(
                 f"trainer.precision: {self.precision} keeps the weights in 16 bits, which loses updates. "

@@ -21,6 +21,7 @@ from hudepth.runs import history
 from hudepth.runs.checkpoint import AtomicCheckpointIO
 from hudepth.training.callbacks import EpochLine, History, Interrupt, PanelPictures
 from hudepth.training.checkpointing import FullSizeEarlyStopping, checkpoint_callbacks
+from hudepth.training.loggers import drop_on_failure
 from hudepth.training.study import TRIAL_ENV, TrialPruner
 from hudepth.training.times import Times
 
@@ -35,7 +36,7 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
         indices = evenly_spaced(sorted(datamodule.split.val), options["panels"])
         how = {"every_n_epochs": options["panels_every_n_epochs"], "max_depth_m": datamodule.max_depth_m}
         callbacks.append(PanelPictures(path / "images", datamodule.store, indices, **how))
-    if shows_progress():
+    if shows_progress() and config["trainer"].get("enable_progress_bar", True):
         callbacks.append(RichProgressBar(leave=False))
     if trial := os.environ.get(TRIAL_ENV):
         callbacks.append(TrialPruner(trial, monitor=monitor))
@@ -51,10 +52,13 @@ def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Cal
     loggers: list[Logger] = [instantiate(extra, trust=config["trust"], only=Logger) for extra in options["extra"]]
     if options["tensorboard"]:
         loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
+    loggers = [drop_on_failure(logger) for logger in loggers]
+    defaults = {
+        "enable_model_summary": False, "enable_progress_bar": shows_progress(), "num_sanity_val_steps": 0,
+        "log_every_n_steps": 1,  # everything is logged per epoch; a larger number only makes Lightning warn
+    }  # fmt: skip
     return build_trainer(
-        config["trainer"], logger=loggers or False, callbacks=callbacks,
-        plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if alone else [])],
-        default_root_dir=path, enable_model_summary=False, enable_progress_bar=shows_progress(), num_sanity_val_steps=0,
+        {**defaults, **config["trainer"]}, logger=loggers or False, callbacks=callbacks,
+        plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if alone else [])], default_root_dir=path,
         use_distributed_sampler=False,  # the data module divides the pairs among processes itself, exactly
-        log_every_n_steps=1,  # everything is logged per epoch; a larger number only makes Lightning warn
     )  # fmt: skip

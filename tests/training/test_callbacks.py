@@ -101,7 +101,9 @@ def test_history_has_one_row_an_epoch(data: DepthDataModule, tmp_path: Path) -> 
         assert rows[-1][name] == value.item()  # written with all digits
 
 
-def test_history_survives_a_resume(data: DepthDataModule, tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_history_survives_a_resume(workers: int, data: DepthDataModule, tmp_path: Path) -> None:
+    data.num_workers = workers
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     fit(data, whole, max_epochs=4)
     with pytest.raises(TrainingError, match="killed"):

@@ -16,6 +16,7 @@ import torch
 import yaml
 
 from hudepth.runs.checkpoint import read_plain
+from hudepth.runs.run import newest_run
 from tests.commands import TINY, Command, script
 
 
@@ -201,7 +202,11 @@ RECIPE = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("recipe", [("schedule=cosine",), RECIPE], ids=["plain", "strong"])
+@pytest.mark.parametrize(
+    "recipe",
+    [("schedule=cosine",), RECIPE, (*RECIPE, "data.num_workers=2", "trainer.accumulate_grad_batches=2")],
+    ids=["plain", "strong", "workers"],
+)
 @pytest.mark.slow
 def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(
     recipe: tuple[str, ...], tmp_path: Path, cache: Path
@@ -297,6 +302,22 @@ def test_a_run_directory_does_not_vouch_for_its_own_classes(command: Command, tr
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("+trainer.fast_dev_run=true",),
+        ("+trainer.enable_progress_bar=false", "+trainer.num_sanity_val_steps=2", "+trainer.log_every_n_steps=10"),
+        ("+trainer.check_val_every_n_epoch=2", "callbacks=early_stopping", "trainer.max_epochs=5"),
+    ],
+)
+def test_lightnings_own_options(options: tuple[str, ...], command: Command, tmp_path: Path) -> None:
+    done = command("train", *TINY, "logger=none", "callbacks.panels=0", "baselines=false", "name=a/b", *options)
+    assert done.code == 0, done.err
+    if "fast_dev_run" not in options[0]:
+        assert newest_run(tmp_path / "runs").parent == tmp_path / "runs" / "a" / "b"
+
+
+@pytest.mark.slow
 def test_a_moved_run_keeps_its_best_when_it_goes_on(command: Command, tmp_path: Path) -> None:
     options = (*TINY, "test=false", "callbacks.panels=0", "logger=none", "monitor=train/loss/total", "mode=max")
     assert command("train", *options, "name=moving").code == 0  # mode=max: the first epoch is the best
@@ -313,6 +334,8 @@ def test_a_moved_run_keeps_its_best_when_it_goes_on(command: Command, tmp_path: 
     [
         ("monitor=val/total", "monitor: no 'val/total'. Did you mean 'val/loss/total'?"),
         ("mode=mni", "mode: 'mni' is not one of min, max. Did you mean"),
+        ("+trainer.logger=false", "trainer.logger is set by hudepth"),
+        ("trainer.precision=64-true", "trainer.precision: 64-true"),
         ("trainer.max_steps=3", "no key 'trainer.max_steps'. Did you mean 'trainer.max_epochs'? See hudepth-train"),
     ],
 )
