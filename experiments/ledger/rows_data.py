@@ -9,7 +9,7 @@ from experiments.ledger.bounds import largest_mean_depth_m, largest_rmse_m
 from experiments.ledger.leakage import expected_share, share_next_to_training, split_frames
 from experiments.ledger.row import Row, Sheet
 from experiments.ledger.units import ERRORS, READINGS, Rooms, Score, scaling_at_eps
-from hudepth.data.encoding import INDOOR_MEDIAN_M
+from hudepth.data.sources.plausible import INDOOR_MEDIAN_M
 from hudepth.data.splits import Split
 
 RIGHT, MISREAD = READINGS

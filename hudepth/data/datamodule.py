@@ -16,6 +16,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, DistributedSampler
 
 from hudepth.base.console import log
+from hudepth.base.errors import DataError
 from hudepth.base.options import Range, Size, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
@@ -87,6 +88,8 @@ class DepthDataModule(LightningDataModule):
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
         self.cache = Path(cache)
+        if self.on_error == "skip":
+            source.unpaired = []
         self._draws: tuple[int, torch.Generator] | None = None
 
     @cached_property
@@ -118,7 +121,11 @@ class DepthDataModule(LightningDataModule):
             log.log(level, text, 100 * beyond, self.max_depth_m, fix if beyond > 0.5 else "")
 
     def train_dataloader(self) -> DataLoader[RawBatch]:
-        """Shuffled training batches; the last, shorter one is kept."""
+        """Shuffled training batches; the last, shorter one is kept. DataError if there are no training pairs."""
+        if not (self.split.train and self.split.val):
+            raise DataError(
+                f"data.split={self.split.kind}: all pairs are test, none train or validate. Pass another data.split."
+            )
         rank, world_size = self._shard()
         dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
         sampler: DistributedSampler[RawBatch] | BlockShuffle

@@ -107,7 +107,7 @@ def _build(
     needed, free = 5 * len(records) * size[0] * size[1], shutil.disk_usage(path.parent).free
     if needed > free:  # for images and depths
         raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
-    skipped: list[str] = []
+    skipped = list(source.unpaired or ())
     histogram = np.zeros(MAX_STORED + 1, np.int64)
     pairs: list[PreparedPair] = []  # without their pixels
     with written_whole(path) as part:

@@ -55,7 +55,8 @@ def make_split(
     Args:
         records: all pairs of a store.
         kind: ``random`` (the paper: frames at random), ``scene`` (no scene in two subsets), or ``official`` (the
-            set's own test pairs; validation taken by scene from its training pairs).
+            set's own test and val pairs; without val pairs, validation is taken by scene from its training pairs), or
+            ``test`` (all pairs are test). If all pairs are test, also by ``fractions``, train and val may be empty.
         seed: of the permutation of frames or scenes.
         fractions: of train, val and test; they sum to 1. ``official`` uses only the ratio of the first two.
 
@@ -64,7 +65,7 @@ def make_split(
     check_split(kind, fractions)
     subsets = dict(zip(SUBSETS, _KINDS[kind](records, seed, fractions), strict=True))
     for name, indices in subsets.items():
-        if not indices:
+        if not indices and (name == "test" or len(subsets["test"]) < len(records) or not records):
             raise DataError(
                 f"data.split={kind}: the {name} subset is empty ({len(records)} pairs, "
                 f"{len({r.scene for r in records})} scenes, fractions {list(fractions)}). "
@@ -116,12 +117,14 @@ def _by_scene(
 
 
 def _official(records: Sequence[Record], seed: int, fractions: Sequence[float]) -> tuple[list[int], ...]:
-    if unknown := sum(record.split not in ("train", "test") for record in records):
+    own_train, val, test = ([i for i, record in enumerate(records) if record.split == name] for name in SUBSETS)
+    if unknown := len(records) - len(own_train) - len(val) - len(test):
         raise DataError(
             f"data.split=official: {unknown} of {len(records)} pairs are in neither 'train' nor 'test' of the set's "
             "own split. Pass data.split=scene or data.split=random."
         )
-    own_train, test = ([i for i, record in enumerate(records) if record.split == name] for name in ("train", "test"))
+    if val:
+        return own_train, val, test
     share = fractions[0] + fractions[1]
     if not own_train or not share:
         return [], [], test
@@ -132,6 +135,7 @@ _KINDS: Mapping[str, Callable[[Sequence[Record], int, Sequence[float]], tuple[li
     "random": _random,
     "scene": lambda records, seed, fractions: _by_scene(records, range(len(records)), seed, fractions),
     "official": _official,
+    "test": lambda records, seed, fractions: ([], [], list(range(len(records)))),
 }
 
 

@@ -59,7 +59,9 @@ def score_checkpoint(
     output_folder(output)
     net = checkpoint.build_net(trust=options.trust)
     predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
-    if options.baselines:
+    if options.baselines and not datamodule.split.train:
+        log.info("no trivial baselines: data.split=%s has no training pairs to make them of", datamodule.split.kind)
+    elif options.baselines:
         predictors |= trivial_baselines(datamodule.store, datamodule.split.train, max_depth_m=datamodule.max_depth_m)
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m, detailed=MODEL)
     if not run_evaluation(evaluation, datamodule, options.trainer):

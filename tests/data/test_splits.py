@@ -250,7 +250,7 @@ def test_no_file(tmp_path: Path) -> None:
 def test_unknown_kind(kind: str, hint: str) -> None:
     with pytest.raises(ConfigError) as caught:
         make_split(frames([10]), kind=kind)
-    assert str(caught.value) == f"data.split: no '{kind}'.{hint} Pass one of random, scene, official."
+    assert str(caught.value) == f"data.split: no '{kind}'.{hint} Pass one of random, scene, official, test."
 
 
 @pytest.mark.parametrize(
@@ -272,7 +272,6 @@ def test_bad_fractions(fractions: list[float]) -> None:
         ("random", frames([10]), (0.5, 0.5, 0.0), "test", "10 pairs, 1 scenes"),
         ("scene", frames([9]), PAPER, "val", "9 pairs, 1 scenes"),
         ("scene", frames([2, 2]), (0.5, 0.0, 0.5), "val", "4 pairs, 2 scenes"),
-        ("official", frames([3], split="test"), PAPER, "train", "3 pairs, 1 scenes"),
         ("official", frames([3, 3], split="train"), PAPER, "val", "6 pairs, 2 scenes"),
         ("official", frames([3, 3], split="train"), (0.5, 0.5, 0.0), "test", "6 pairs, 2 scenes"),
         ("official", [*frames([3], split="train"), *frames([3], split="test")], (0.0, 0.0, 1.0), "train",
@@ -310,3 +309,18 @@ def test_no_official_split() -> None:
         "data.split=official: 4 of 14 pairs are in neither 'train' nor 'test' of the set's own split. "
         "Pass data.split=scene or data.split=random."
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "split", "fractions"),
+    [("test", "", PAPER), ("official", "test", PAPER), ("random", "", (0, 0, 1)), ("scene", "", (0.0, 0.0, 1.0))],
+)
+def test_a_set_may_be_all_test(kind: str, split: str, fractions: tuple[float, float, float]) -> None:
+    made = make_split(frames([2, 3], split=split), kind=kind, fractions=fractions)
+    assert (made.train, made.val, sorted(made.test)) == ([], [], list(range(5)))
+
+
+def test_a_sets_own_validation_pairs_are_used() -> None:
+    records = [*frames([3], split="train"), *frames([2], split="val"), *frames([2], split="test")]
+    made = make_split(records, kind="official")
+    assert (made.train, made.val, made.test) == ([0, 1, 2], [3, 4], [5, 6])

@@ -54,13 +54,14 @@ def audit(config: Mapping[str, Any], datamodule: DepthDataModule) -> None:
     """
     options = parse(AuditOptions, config)
     source, kind = datamodule.source, datamodule.split_kind
+    source.unpaired = []  # files without partner are findings, too
     listed = source.records()
     output = output_folder(options.output or f"audit_{source.name}")
     store, refused = _prepare(options.images, datamodule, listed)
     records = store.records if store else listed  # skipped pairs are in no split
     scan = scan_store(store) if store else None
     splits = {name: _audit_split(name, datamodule, records, scan) for name in KINDS}
-    chosen = splits[kind]
+    chosen = splits.get(kind)
     if isinstance(chosen, AuditedSplit):
         findings = [judge_split(kind, chosen.leak, chosen.copies)]
     else:
@@ -100,6 +101,8 @@ def _audit_split(
         split = make_split(records, kind=kind, seed=datamodule.split_seed, fractions=datamodule.fractions)
     except DataError as error:
         return str(error)
+    if not split.train:
+        return f"data.split={kind}: no pair trains, so nothing leaks."
     copies = find_duplicates(split, scan.hashes, scan.digests) if scan else None
     return AuditedSplit(split, measure_leakage(records, split), copies)
 

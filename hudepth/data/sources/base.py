@@ -71,6 +71,8 @@ class Source(ABC):
     """Scale of ``linear`` and ``disparity`` where a record has none; see :func:`hudepth.data.encoding.to_metres`."""
     invalid: Sequence[float] | None = None
     """Stored values that mean "no reading"; None: the largest of an integer type of 16 bits or more."""
+    unpaired: list[str] | None = None
+    """A list if :meth:`records` is to leave out files without partner and note them there; None if to refuse them."""
     auto_uint8: ClassVar[str | None] = None
     """Encoding of 8-bit depth under ``encoding=auto``; None if only the user can know."""
 
@@ -105,7 +107,7 @@ class Source(ABC):
         digest = hashlib.sha256(json.dumps([asdict(record) for record in self.records()]).encode())
         for path in self.files():
             size = path.stat().st_size if path.exists() else -1
-            digest.update(f"{path.name}:{size};".encode())
+            digest.update(f"{path.name}:{size};".encode("utf-8", "surrogateescape"))
         return digest.hexdigest()
 
 

@@ -78,11 +78,14 @@ def inside(root: Path, name: str, *, where: str) -> Path:
 def csv_rows(data: bytes, *, where: str) -> list[tuple[int, list[str]]]:
     """Return (line number, cells) for each line of a CSV file that is not blank, whatever its line ends.
 
-    Raises DataError if it is not UTF-8 text or not a CSV.
+    Cells are separated by commas, or by what the first line has more of: semicolons, as Excel writes in many
+    countries, or tabs. Raises DataError if it is not UTF-8 text or not a CSV.
     """
     try:
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
-        return [(reader.line_num, cells) for cells in reader if cells]
+        text = data.decode("utf-8-sig")
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        return [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{where}: not a CSV file in UTF-8 ({error}). Write it again.") from None
 

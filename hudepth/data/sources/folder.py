@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
+from unicodedata import normalize
 
 from hudepth.base.errors import DataError
 from hudepth.data.encoding import ENCODINGS, Encoding
 from hudepth.data.sources.base import Record, existing_root
 from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, OTHER_DEPTH_SUFFIXES, FileSource, inside
-from hudepth.data.sources.pairing import pair_up, unique_keys, walk_files
+from hudepth.data.sources.pairing import pair_up, printable, unique_keys, walk_files
 
 
 @dataclass(eq=False)
@@ -46,10 +47,14 @@ class FolderSource(FileSource):
                 f"data.encoding is not set, and a folder does not state its unit. Pass one of {', '.join(ENCODINGS)}."
             )
         images, depths = self._find(root)
+        if self.unpaired:
+            self.unpaired.clear()
         expects = f"'{self.images}/<name>{self.image_suffix}.jpg' with '{self.depths}/<name>{self.depth_suffix}.png'"
         frames: dict[str, int] = {}
         records = []
-        for key, image, depth in pair_up(images, depths, root=root, expects=f"{expects} (or .npy, .tif)"):
+        for key, image, depth in pair_up(
+            images, depths, root=root, expects=f"{expects} (or .npy, .tif)", unpaired=self.unpaired
+        ):
             scene = PurePosixPath(key).parent.as_posix().removeprefix(".")
             frames[scene] = frames.get(scene, -1) + 1
             records.append(Record(id=key, scene=scene, frame=frames[scene], image=image, depth=depth))
@@ -88,7 +93,11 @@ class FolderSource(FileSource):
                 f"Pass data.source.{what}=<folder within data.root>."
             )
         return [
-            (str(path.with_suffix("")).removesuffix(suffix), str(PurePosixPath(folder) / path))
+            # Macs write accents as letters of their own, which are the same name.
+            (
+                normalize("NFC", printable(str(path.with_suffix("")).removesuffix(suffix))),
+                str(PurePosixPath(folder) / path),
+            )
             for path in walk_files(base)
             if path.suffix.lower() in extensions and path.stem.endswith(suffix)
         ]

@@ -30,7 +30,7 @@ class ManifestSource(FileSource):
     id or index       optional, unique; the image's path without extension if there is neither
     scene             optional; frames of a scene belong together
     frame             optional whole number; position within the scene, by default in order of the list
-    split             optional: ``train``, ``test`` or empty
+    split             optional: ``train``, ``val``, ``test`` or empty; without ``val``, it is taken from ``train``
     category          optional: kind of scene
     depth_scale_m     optional [m]: depth = (value + depth_offset) * depth_scale_m, see ``linear`` in
                       :func:`hudepth.data.encoding.to_metres`
@@ -64,9 +64,12 @@ class ManifestSource(FileSource):
         frames: dict[str, int] = {}
         for line, cells in rows[1:]:
             where = f"'{index}' line {line}"
+            while len(cells) > len(header) and not cells[-1].strip():  # commas that Excel adds
+                cells.pop()
             if len(cells) != len(header):
                 raise DataError(f"{where}: {len(cells)} cells for {len(header)} columns. Complete the line.")
             row = {column: cell.strip() for column, cell in zip(header, cells, strict=True)}
+            row |= {column: row[column].replace("\\", "/") for column in _REQUIRED}  # written on Windows
             record = self._record(row, folder, frames, where)
             if record.id in lines:
                 raise DataError(f"{where}: id '{record.id}' is taken by line {lines[record.id]}. Make ids unique.")
@@ -98,10 +101,12 @@ class ManifestSource(FileSource):
 
     def _record(self, row: Mapping[str, str], folder: Path, frames: dict[str, int], where: str) -> Record:
         for column in _REQUIRED:
+            if not row[column]:
+                raise DataError(f"{where}: the cell of {column} is empty. Complete the line, or remove it.")
             inside(folder, row[column], where=where)
         scene, split = row.get("scene", ""), row.get("split", "")
-        if split not in ("", "train", "test"):
-            raise DataError(f"{where}: unknown split '{split}'. Write train, test, or nothing.")
+        if split not in ("", "train", "val", "test"):
+            raise DataError(f"{where}: unknown split '{split}'. Write train, val, test, or nothing.")
         frames[scene] = frames.get(scene, -1) + 1
         frame = row.get("frame") or str(frames[scene])
         if not (frame.isascii() and frame.isdigit() and len(frame) < 19):

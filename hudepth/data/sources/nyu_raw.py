@@ -12,7 +12,7 @@ from hudepth.data.encoding import Encoding
 from hudepth.data.sources import nyu
 from hudepth.data.sources.base import Record, existing_root
 from hudepth.data.sources.files import FileSource
-from hudepth.data.sources.pairing import pair_up, unique_keys, walk_files
+from hudepth.data.sources.pairing import pair_up, printable, unique_keys, walk_files
 
 _EXPECTS = "rgb_XXXXX.jpg with sync_depth_XXXXX.png"
 _IMAGE = re.compile(r"rgb_([0-9]{1,9})\.(jpe?g|png)")
@@ -38,13 +38,15 @@ class NyuRawSource(nyu.Nyu, FileSource):
         root = self.folder()
         images, depths = [], []
         for path in walk_files(root):
-            scene = root.resolve().name if path.parent == PurePosixPath(".") else path.parent.as_posix()
+            scene = root.resolve().name if path.parent == PurePosixPath(".") else printable(path.parent.as_posix())
             if image := _IMAGE.fullmatch(path.name):
                 images.append((f"{scene}/{image[1]}", str(path)))
             elif depth := _DEPTH.fullmatch(path.name):
                 depths.append((f"{scene}/{depth[1]}", str(path)))
+        if self.unpaired:
+            self.unpaired.clear()
         by_key = unique_keys(images, what="image"), unique_keys(depths, what="depth")
-        return [_record(*pair) for pair in pair_up(*by_key, root=root, expects=_EXPECTS)]
+        return [_record(*pair) for pair in pair_up(*by_key, root=root, expects=_EXPECTS, unpaired=self.unpaired)]
 
     def folder(self) -> Path:
         """Return the root."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from hudepth.base.errors import ConfigError, DataError
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.prepare import prepare
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.folder import FolderSource
 
@@ -81,13 +84,14 @@ def test_encoding_is_required(tmp_path: Path) -> None:
 def test_unpaired(tmp_path: Path) -> None:
     write(tmp_path, "images/a.jpg", "images/b.jpg", "images/c.jpg", "depths/a.png")
     expects = "Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
+    skip = "Pass data.on_error=skip to leave them out."
     source = FolderSource(tmp_path, encoding="auto")
     assert refusal(source) == (
-        f"data.root: 2 of 3 images in '{tmp_path}' have no depth, the first is 'images/b.jpg'. {expects}"
+        f"data.root: 2 of 3 images in '{tmp_path}' have no depth, the first is 'images/b.jpg'. {expects} {skip}"
     )
     write(tmp_path, "depths/b.png", "depths/c.png", "depths/x/d.npy")
     assert refusal(source) == (
-        f"data.root: 1 of 4 depth maps in '{tmp_path}' have no image, the first is 'depths/x/d.npy'. {expects}"
+        f"data.root: 1 of 4 depth maps in '{tmp_path}' have no image, the first is 'depths/x/d.npy'. {expects} {skip}"
     )
     write(tmp_path, "depths/a.npy")
     assert refusal(source) == ("'depths/a.npy' and 'depths/a.png' are both the depth of 'a'. Keep one of them.")
@@ -135,3 +139,30 @@ def test_unequal_sizes(tmp_path: Path) -> None:
         f"'{tmp_path / 'images/a.png'}' is 8 x 6 pixels but '{tmp_path / 'depths/a.npy'}' is 6 x 8. "
         "Both must have one size."
     )
+
+
+def test_names_that_are_not_utf8_and_decomposed_accents(tmp_path: Path) -> None:
+    files = [(b"images/caf\xe9.jpg", b"depths/caf\xe9.png"), ("images/é.jpg".encode(), "depths/e\u0301.png".encode())]
+    for folder in ("images", "depths"):
+        (tmp_path / folder).mkdir()
+    for image, depth in files:
+        cv2.imwrite(str(tmp_path / "i.jpg"), np.zeros((4, 6, 3), np.uint8))
+        cv2.imwrite(str(tmp_path / "d.png"), np.full((4, 6), 2000, np.uint16))
+        (tmp_path / "i.jpg").rename(os.fsdecode(os.fsencode(tmp_path) + b"/" + image))
+        (tmp_path / "d.png").rename(os.fsdecode(os.fsencode(tmp_path) + b"/" + depth))
+    source = FolderSource(tmp_path, encoding="uint16_mm")
+    assert [record.id for record in source.records()] == ["caf\\xe9", "é"]
+    store = prepare(source, size=(4, 6), cache=tmp_path / "cache")
+    assert [record.id for record in store.records] == ["caf\\xe9", "é"]
+
+
+def test_unpaired_files_are_listed_as_skipped(tmp_path: Path) -> None:
+    for folder in ("images", "depths"):
+        (tmp_path / folder).mkdir()
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / f"images/{i}.jpg"), np.zeros((4, 6, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "depths/1.png"), np.full((4, 6), 2000, np.uint16))
+    (tmp_path / "images/._1.jpg").write_bytes(b"\0\5\x16\7")
+    data = DepthDataModule(FolderSource(tmp_path, encoding="uint16_mm"), size=4, cache=tmp_path, on_error="skip")
+    assert [record.id for record in data.store.records] == ["1"]
+    assert data.store.info["skipped"] == ["'images/0.jpg': has no depth."]

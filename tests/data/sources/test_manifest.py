@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from hudepth.base.errors import ConfigError, DataError
-from hudepth.data.encoding import check_range, to_metres
+from hudepth.data.encoding import to_metres
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.manifest import ManifestSource, NyuLabeledSource
+from hudepth.data.sources.plausible import check_range
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 9999, (6, 8), dtype=np.uint16)
@@ -143,15 +144,15 @@ LINES = [
     ),
     (
         ("a.jpg;a.png",),
-        "'{index}': no column image and depth, found a.jpg;a.png. Name the columns in its first line.",
+        "'{index}': no column image and depth, found a.jpg, a.png. Name the columns in its first line.",
     ),
     ((), "'{index}': no column image and depth, found nothing. Name the columns in its first line."),
     (("image,depth",), "'{index}': lists no pairs. Add a line for each pair."),
     (("image,depth", "a,b", "c"), "'{index}' line 3: 1 cells for 2 columns. Complete the line."),
     (("image,depth", "a,b,c"), "'{index}' line 2: 3 cells for 2 columns. Complete the line."),
     (
-        ("image,depth,split", "a,b,val"),
-        "'{index}' line 2: unknown split 'val'. Write train, test, or nothing.",
+        ("image,depth,split", "a,b,dev"),
+        "'{index}' line 2: unknown split 'dev'. Write train, val, test, or nothing.",
     ),
     (
         ("id,image,depth", "1,a,b", "2,a,b", "1,c,d"),
@@ -167,7 +168,7 @@ LINES = [
     ),
     (
         ("image,depth", "a.jpg,"),
-        "'{index}' line 2: path '' is not inside the data folder. Use paths relative to '{root}'.",
+        "'{index}' line 2: the cell of depth is empty. Complete the line, or remove it.",
     ),
     (
         ("image,depth,frame", "a,b,-1"),
@@ -240,3 +241,25 @@ def test_labelled_nyu_in_metres(nyu_root: Path) -> None:
     found = check_range(depths, indoor=source.indoor, encoding="linear", name=source.name)
     assert 0.0 < found.min_m < found.median_m < found.max_m < 10.5
     assert found.valid_fraction == 1.0
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("image,depth", "a/1.jpg,a/1.png", ",", ",", "", "   "),
+        ("image,depth,,", "a/1.jpg,a/1.png,,"),
+        ("image,depth", "a/1.jpg,a/1.png,,"),
+        ("image;depth", "a/1.jpg;a/1.png"),
+        ("image\tdepth", "a/1.jpg\ta/1.png"),
+        ("image,depth", "a\\1.jpg,a\\1.png"),
+    ],
+    ids=["blank", "columns", "commas", "semicolons", "tabs", "backslashes"],
+)
+def test_lists_as_spreadsheets_write_them(tmp_path: Path, lines: tuple[str, ...]) -> None:
+    write_list(tmp_path, *lines, bom=True)
+    assert [(r.image, r.depth) for r in ManifestSource(tmp_path).records()] == [("a/1.jpg", "a/1.png")]
+
+
+def test_own_validation_pairs(tmp_path: Path) -> None:
+    write_list(tmp_path, "image,depth,split", "a,b,train", "c,d,val", "e,f,test")
+    assert [record.split for record in ManifestSource(tmp_path).records()] == ["train", "val", "test"]

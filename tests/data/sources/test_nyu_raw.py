@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from hudepth.base.errors import ConfigError, DataError
-from hudepth.data.encoding import check_range, to_metres
+from hudepth.data.encoding import to_metres
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.nyu_raw import NyuRawSource
+from hudepth.data.sources.plausible import check_range
 
 RGB = np.full((6, 8, 3), 200, np.uint8)
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8)
 EXPECTED = "Expected rgb_XXXXX.jpg with sync_depth_XXXXX.png."
+SKIP = "Pass data.on_error=skip to leave them out."
 
 
 def write(folder: Path, *numbers: str) -> None:
@@ -82,14 +84,15 @@ def test_refusals(tmp_path: Path) -> None:
     (tmp_path / "a/sync_depth_00001.png").unlink()
     (tmp_path / "a/sync_depth_00002.png").unlink()
     assert refusal(NyuRawSource(tmp_path)) == (
-        f"data.root: 2 of 3 images in '{tmp_path}' have no depth, the first is 'a/rgb_00001.jpg'. {EXPECTED}"
+        f"data.root: 2 of 3 images in '{tmp_path}' have no depth, the first is 'a/rgb_00001.jpg'. {EXPECTED} {SKIP}"
     )
     (tmp_path / "a/rgb_00001.jpg").unlink()
     (tmp_path / "a/rgb_00002.jpg").unlink()
     write(tmp_path / "b", "00005")
     (tmp_path / "b/rgb_00005.jpg").unlink()
     assert refusal(NyuRawSource(tmp_path)) == (
-        f"data.root: 1 of 2 depth maps in '{tmp_path}' have no image, the first is 'b/sync_depth_00005.png'. {EXPECTED}"
+        f"data.root: 1 of 2 depth maps in '{tmp_path}' have no image, the first is 'b/sync_depth_00005.png'. "
+        f"{EXPECTED} {SKIP}"
     )
     (tmp_path / "a/rgb_00000.png").touch()
     assert refusal(NyuRawSource(tmp_path)) == (
