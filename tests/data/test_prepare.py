@@ -248,7 +248,8 @@ def truncated_jpeg(root: Path) -> str:
 
 def unequal(root: Path) -> str:
     cv2.imwrite(str(root / "depths/02.png"), np.full((12, 17), 2000, np.uint16))
-    return f"'{root}/images/02.png' is 18 x 12 pixels but '{root}/depths/02.png' is 17 x 12. Both must have one size."
+    found = f"'{root}/images/02.png' is 18 x 12 pixels but '{root}/depths/02.png' is 17 x 12. Both must have one size."
+    return f"{found} If they show the same view, pass data.source.unequal_sizes=true."
 
 
 def one_of_8_bits(root: Path) -> str:

@@ -96,7 +96,7 @@ class Source(ABC):
 
     @abstractmethod
     def read(self, record: Record) -> RawPair:
-        """Decode one pair; DataError if a file is missing, truncated, too large, or image and depth differ in size."""
+        """Decode one pair; DataError if a file is missing, truncated, too large, or image and depth do not fit."""
 
     def files(self) -> Sequence[Path]:
         """Return every file this source reads; empty for generated data."""

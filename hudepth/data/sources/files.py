@@ -28,6 +28,9 @@ Handle = TypeVar("Handle")
 class FileSource(EncodedSource):
     """A source whose records name files by their paths relative to a folder."""
 
+    unequal_sizes: bool | None = None
+    """Whether image and depth may differ in size, if both show the same view; None if this is no option."""
+
     @abstractmethod
     def folder(self) -> Path:
         """Return the folder of the files; DataError if it is missing."""
@@ -35,7 +38,10 @@ class FileSource(EncodedSource):
     def read(self, record: Record) -> RawPair:
         """Decode the two files of a pair; see :meth:`Source.read`."""
         image, depth = (inside(self.folder(), name, where="data.root") for name in (record.image, record.depth))
-        return make_pair(read_image(image), read_depth(depth), image_where=f"'{image}'", depth_where=f"'{depth}'")
+        return make_pair(
+            read_image(image), read_depth(depth),
+            image_where=f"'{image}'", depth_where=f"'{depth}'", unequal=self.unequal_sizes,
+        )  # fmt: skip
 
     def files(self) -> Sequence[Path]:
         """Return every image and depth map."""
@@ -90,12 +96,24 @@ def csv_rows(data: bytes, *, where: str) -> list[tuple[int, list[str]]]:
         raise DataError(f"{where}: not a CSV file in UTF-8 ({error}). Write it again.") from None
 
 
-def make_pair(image: NDArray[np.uint8], depth: NDArray[np.generic], *, image_where: str, depth_where: str) -> RawPair:
-    """Join an image and its depth; DataError if they differ in size."""
-    if image.shape[:2] != depth.shape:
-        (height, width), (rows, columns) = image.shape[:2], depth.shape
-        raise DataError(
-            f"{image_where} is {width} x {height} pixels but {depth_where} is {columns} x {rows}. "
-            "Both must have one size."
-        )
+def make_pair(
+    image: NDArray[np.uint8],
+    depth: NDArray[np.generic],
+    *,
+    image_where: str,
+    depth_where: str,
+    unequal: bool | None = None,
+) -> RawPair:
+    """Join an image and its depth. ``unequal``: whether sizes may differ; None if the source has no such option.
+
+    Raises DataError if they differ in size, or if they may, in aspect ratio.
+    """
+    (height, width), (rows, columns) = image.shape[:2], depth.shape
+    # The aspect ratio of the smaller one is only known to a pixel.
+    alike = abs(width * rows - height * columns) <= max(height, rows)
+    if image.shape[:2] != depth.shape and not (alike and unequal):
+        fix = f"Both must have one {'aspect ratio' if unequal else 'size'}."
+        if alike and unequal is False:
+            fix += " If they show the same view, pass data.source.unequal_sizes=true."
+        raise DataError(f"{image_where} is {width} x {height} pixels but {depth_where} is {columns} x {rows}. {fix}")
     return RawPair(image=image, depth=depth)

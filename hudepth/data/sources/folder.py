@@ -38,6 +38,7 @@ class FolderSource(FileSource):
     depth_suffix: str = ""
     encoding: Encoding | None = None  # type: ignore[assignment]  # checked by records()
     indoor: bool = True
+    unequal_sizes: bool = False
 
     def records(self) -> Sequence[Record]:
         """List the pairs in natural order of their names; see :meth:`Source.records`."""

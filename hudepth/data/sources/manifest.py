@@ -48,6 +48,7 @@ class ManifestSource(FileSource):
     manifest: str = "index.csv"
     encoding: Encoding = "auto"
     indoor: bool = True
+    unequal_sizes: bool = False
 
     def records(self) -> Sequence[Record]:
         """List the pairs in order of the CSV file; see :meth:`Source.records`."""

@@ -166,3 +166,20 @@ def test_unpaired_files_are_listed_as_skipped(tmp_path: Path) -> None:
     data = DepthDataModule(FolderSource(tmp_path, encoding="uint16_mm"), size=4, cache=tmp_path, on_error="skip")
     assert [record.id for record in data.store.records] == ["1"]
     assert data.store.info["skipped"] == ["'images/0.jpg': has no depth."]
+
+
+def test_image_and_depth_of_two_sizes(tmp_path: Path) -> None:
+    for folder in ("images", "depths"):
+        (tmp_path / folder).mkdir()
+    cv2.imwrite(str(tmp_path / "images/a.png"), RGB)
+    np.save(tmp_path / "depths/a.npy", np.full((3, 4), 2, np.float32))
+    refused = FolderSource(tmp_path, encoding="float_m")
+    with pytest.raises(DataError, match=r"data\.source\.unequal_sizes=true"):
+        refused.read(refused.records()[0])
+    source = FolderSource(tmp_path, encoding="float_m", unequal_sizes=True)
+    store = prepare(source, size=(6, 8), cache=tmp_path)
+    assert store.read_native(0).shape == (3, 4)
+    assert [array.shape for array in store.read([0])] == [(1, 6, 8, 3), (1, 6, 8)]
+    np.save(tmp_path / "depths/a.npy", np.full((4, 4), 2, np.float32))
+    with pytest.raises(DataError, match="aspect ratio"):
+        source.read(source.records()[0])
