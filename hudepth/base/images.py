@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
+import struct
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +28,6 @@ from PIL import (
 )
 
 from hudepth.base.errors import DataError
-from hudepth.base.exif import check_tags, orientation
 
 _PLUGINS = (
     JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin, TiffImagePlugin, GifImagePlugin,
@@ -40,13 +42,14 @@ SUFFIXES = (
 
 MAX_PIXELS = 100_000_000
 """Larger images are refused before they are decoded."""
-
-_TURNS = {
+_ORIENTATION = 0x0112  # a tag of EXIF
+_MAX_EXIF = 1 << 20  # bytes; a segment of a JPEG holds 65,533
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}  # bytes by type
+_TURNS = {  # by orientation: what brings it upright
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
     5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }  # fmt: skip
-"""What brings a picture of each orientation upright."""
 MAX_FILE_BYTES = 1 << 30
 """Larger files are refused before they are read."""
 
@@ -79,7 +82,7 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
     if not data:
         raise DataError(f"{where}: the file is empty (0 bytes). Copy it again.")
     try:
-        check_tags(data, where=where)
+        _check_tags(data, where)
         with Image.open(io.BytesIO(data), formats=FORMATS) as image:
             check_pixels(image.height, image.width, where=where, most=max_pixels)
             notes = _notes(image)
@@ -107,7 +110,7 @@ def _notes(image: Image.Image) -> tuple[str, ...]:
 
 
 def _to_rgb(image: Image.Image, where: str) -> UInt8[np.ndarray, "h w 3"]:
-    turn = _TURNS.get(orientation(image))
+    turn = _TURNS.get(_orientation(image))
     upright = image if turn is None else image.transpose(turn)
     if upright.mode == "RGB":
         return np.asarray(upright, np.uint8)
@@ -120,6 +123,52 @@ def _to_rgb(image: Image.Image, where: str) -> UInt8[np.ndarray, "h w 3"]:
         white = Image.new("RGBA", rgba.size, (255, 255, 255, 255))
         upright = Image.alpha_composite(white, rgba)
     return np.asarray(upright.convert("RGB"), np.uint8)
+
+
+def _check_tags(data: bytes, where: str) -> None:
+    """Refuse overlapping tags of a TIFF or of EXIF: Pillow copies each, so a small file would fill the memory."""
+    jpeg = _jpeg_exif(data) if data[:2] == b"\xff\xd8" else b""
+    starts = [m.start() for m in islice(re.finditer(rb"II\*\0|MM\0\*", data), 9)] if data[4:8] == b"ftyp" else [0]
+    blocks = [memoryview(jpeg or data)[at:] for at in starts]  # of an AVIF, from where its EXIF may begin
+    overlap = any(sum(min(size, len(each)) for size, _ in _tags(each).values()) > 4 * len(each) for each in blocks)
+    if overlap or len(jpeg) > _MAX_EXIF or len(blocks) > 8:
+        raise DataError(f"{where}: its tags (EXIF) overlap or are too many. Save the picture again without them.")
+
+
+def _orientation(image: Image.Image) -> Any:
+    if image.format == "TIFF":
+        return getattr(image, "tag_v2", {}).get(_ORIENTATION, 1)
+    return _tags(bytes(image.info.get("exif", b"")).removeprefix(b"Exif\0\0")).get(_ORIENTATION, (0, 1))[1]
+
+
+def _jpeg_exif(data: bytes) -> bytes:
+    """Return the EXIF block of a JPEG file: its segments one after another, as Pillow joins them."""
+    at, parts = 2, []
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        length = -1 if data[at + 1] == 0xFF else int.from_bytes(data[at + 2 : at + 4], "big")  # -1: a fill byte
+        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
+            parts.append(data[at + 10 : at + 2 + length])
+        at += 2 + length
+    return b"".join(parts)
+
+
+def _tags(block: bytes | memoryview) -> dict[int, tuple[int, int]]:
+    """Return size and first number of each tag of the first directory of a TIFF structure; empty if it is none."""
+    order = {b"II": "<", b"MM": ">"}.get(bytes(block[:2]))
+    if order is None or len(block) < 16:
+        return {}
+    big = block[2:4] in (b"+\0", b"\0+")  # BigTIFF
+    start = struct.unpack_from(f"{order}Q" if big else f"{order}I", block, 8 if big else 4)[0]
+    head, entry = (f"{order}Q", f"{order}HHQ8s") if big else (f"{order}H", f"{order}HHI4s")
+    if start + struct.calcsize(head) > len(block):
+        return {}
+    (count,) = struct.unpack_from(head, block, start)
+    at, tags = start + struct.calcsize(head), {}
+    for _ in range(min(count, (len(block) - at) // struct.calcsize(entry))):
+        tag, kind, length, value = struct.unpack_from(entry, block, at)
+        tags[tag] = (_SIZES.get(kind, 1) * length, struct.unpack_from(f"{order}H", value)[0] if kind == 3 else 0)
+        at += struct.calcsize(entry)
+    return tags
 
 
 def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
@@ -147,20 +196,6 @@ def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h
         alpha = array[..., 3:].astype(np.float32) / 255
         array = np.rint(array[..., :3] * alpha + 255 * (1 - alpha))
     return np.ascontiguousarray(array, np.uint8)
-
-
-def is_image(path: Path) -> bool:
-    """Return whether a file begins as an image does; False if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError:
-        return False
-    return (
-        head.startswith((b"\xff\xd8\xff", b"\x89PNG", b"GIF8", b"II*\0", b"MM\0*"))
-        or head[4:8] == b"ftyp"
-        or (head[:4] == b"RIFF" and head[8:12] == b"WEBP")
-    )
 
 
 def read_bytes(path: Path) -> bytes:

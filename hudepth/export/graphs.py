@@ -43,8 +43,10 @@ def describe(info: ModelInfo) -> dict[str, str]:
         mean_std = "less (0.485, 0.456, 0.406), over (0.229, 0.224, 0.225)"
         image = f"float32 [batch, 3, {height}, {width}], RGB in [0, 1] {mean_std}"
         depth = f"float32 [batch, 1, {height}, {width}], depth / {info.max_depth_m:g} m"
+    averaged = f"the whole image to {width} x {height}, averaged over areas where it shrinks (OpenCV's INTER_AREA)"
     return {
         KEY: info.to_json(),
+        "resize": f"{averaged}, else bilinear; another method shifts depth by centimetres",
         "input": f"{INPUT}: {image}",
         "output": f"{OUTPUTS[info.processing]}: {depth}",
         "max_depth_m": f"{info.max_depth_m:g}",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hudepth.base.errors import DataError
-from hudepth.base.images import SUFFIXES, is_image
+from hudepth.base.images import SUFFIXES
 
 VIDEO_SUFFIXES = (
     ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv",
@@ -91,7 +91,21 @@ def _is_result(file: Path, root: Path, output: Path | None) -> bool:
 
 def _is_photo(file: Path) -> bool:
     suffix = file.suffix.lower()
-    return suffix in (*SUFFIXES, *UNREAD_SUFFIXES) or (not suffix and is_image(file))
+    return suffix in (*SUFFIXES, *UNREAD_SUFFIXES) or (not suffix and _is_image(file))
+
+
+def _is_image(path: Path) -> bool:
+    """Return whether a file begins as an image does; False if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError:
+        return False
+    return (
+        head.startswith((b"\xff\xd8\xff", b"\x89PNG", b"GIF8", b"II*\0", b"MM\0*"))
+        or head[4:8] == b"ftyp"
+        or (head[:4] == b"RIFF" and head[8:12] == b"WEBP")
+    )
 
 
 def _names(files: list[Path]) -> str:

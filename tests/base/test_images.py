@@ -148,8 +148,13 @@ def test_one_tag_is_read_of_exif() -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [jpeg_with(tagged(3000, 20_000)), jpeg_with(*[tagged(0, 60_000)] * 30), tagged(5000, 10_000_000)]
-)
+    "data",
+    [
+        jpeg_with(tagged(3000, 20_000)), jpeg_with(*[tagged(0, 60_000)] * 30), tagged(5000, 10_000_000),
+        b"\0\0\0\x18ftypavif" + bytes(40) + tagged(5000, 1_000_000) + bytes(1_000_000),
+    ],
+    ids=["jpeg", "segments", "tiff", "avif"],
+)  # fmt: skip
 def test_tags_cannot_fill_the_memory(data: bytes) -> None:
     with pytest.raises(DataError, match=r"x\.jpg: .*EXIF"):
         read_photo(data, where="x.jpg")

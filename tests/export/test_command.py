@@ -143,6 +143,7 @@ def test_onnx_states_names_units_and_origin(exported: Path) -> None:
     assert (entry.name, entry.type, entry.shape[1:]) == ("image", "tensor(uint8)", [32, 48, 3])
     assert (exit_.name, exit_.type) == ("depth_m", "tensor(float)")
     stated = session.get_modelmeta().custom_metadata_map
+    assert "INTER_AREA" in stated["resize"]
     assert stated["input"] == "image: uint8 [batch, 32, 48, 3], RGB, the whole image resized to this size"
     assert stated["output"].endswith("distance along the optical axis in metres")
     assert json.loads(stated["trained_on"])["source"] == "rooms"
