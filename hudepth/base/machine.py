@@ -109,3 +109,13 @@ def keep_freed_memory() -> bool:
         return False
     never = 2**31 - 1
     return bool(mallopt(M_MMAP_THRESHOLD, 2**30) and mallopt(M_TRIM_THRESHOLD, never))
+
+
+def largest_file() -> float:
+    """Return how many bytes a file of this process may have; infinity without a limit."""
+    try:
+        import resource
+    except ImportError:  # not a Unix
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else limit

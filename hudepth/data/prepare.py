@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hudepth.base.console import log, track
 from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
+from hudepth.base.machine import largest_file
 from hudepth.base.options import convert
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres, values_per_metre
 from hudepth.data.sources.base import Record, Source
@@ -107,6 +108,8 @@ def _build(
     needed, free = 5 * len(records) * size[0] * size[1], shutil.disk_usage(path.parent).free
     if needed > free:  # for images and depths
         raise OSError(errno.ENOSPC, f"it takes {needed / 1e6:,.1f} MB or more, {free / 1e6:,.1f} MB are free")
+    if needed + 12_288 > (limit := largest_file()):  # HDF5 crashes if it cannot write its first headers
+        raise OSError(errno.EFBIG, f"it takes {needed / 1e6:,.1f} MB or more, ulimit -f is {limit / 1e6:,.1f} MB")
     skipped = list(source.unpaired or ())
     histogram = np.zeros(MAX_STORED + 1, np.int64)
     pairs: list[PreparedPair] = []  # without their pixels

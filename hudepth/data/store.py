@@ -81,13 +81,18 @@ class StoreWriter:
     def __init__(self, path: Path, *, size: tuple[int, int], native: bool, per_m: int = MM_PER_M) -> None:
         with _plain_os_errors():
             self._file = h5py.File(path, "w", libver="latest")
-        self._image, self._depth = (
-            self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
-            for name, dtype, shape in (("image", "u1", (*size, 3)), ("depth_mm", "u2", size))
-        )
+            try:
+                self._image, self._depth = (
+                    self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
+                    for name, dtype, shape in (("image", "u1", (*size, 3)), ("depth_mm", "u2", size))
+                )
+                if native:
+                    self._png = self._file.create_dataset("native/png", (0,), "u1", maxshape=(None,), chunks=(1 << 20,))
+                self._file.flush()  # a file that cannot hold even this is aborted now
+            except BaseException:
+                self.abort()
+                raise
         self._native, self._per_m = native, per_m
-        if native:
-            self._png = self._file.create_dataset("native/png", (0,), "u1", maxshape=(None,), chunks=(1 << 20,))
         self._ends: list[int] = []
         self._records: list[Record] = []
 
@@ -177,9 +182,10 @@ class DepthStore:
                 for frame, *texts in zip(frames, *columns, strict=True)
             ]
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-            raise DataError(
-                f"'{self.path}' cannot be read as a depth store ({error}). Delete it and prepare again."
-            ) from error
+            fix = "Delete it and prepare again."
+            if "lock file" in str(error):  # a disk over the network that has no locks
+                fix = "Set the environment variable HDF5_USE_FILE_LOCKING=FALSE, or pass paths.cache=<a local folder>."
+            raise DataError(f"'{self.path}' cannot be read as a depth store ({error}). {fix}") from error
 
     def __len__(self) -> int:
         return len(self.records)

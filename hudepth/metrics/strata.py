@@ -83,9 +83,11 @@ def strata_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float64[Te
 
 def _binned(index: Int[Tensor, "b n"], terms: Sequence[Shaped[Tensor, "b 1 h w"]]) -> Float64[Tensor, "b bins k"]:
     """Sum over cells, then over the cells of each bin: one pass over the pixels serves all groups."""
-    weights = [None, *(term.double().flatten() for term in terms)]
-    size = len(index) * (_CELLS + 1)
-    sums = torch.stack([torch.bincount(index.flatten(), w, minlength=size).double() for w in weights], dim=-1)
+    size, places = len(index) * (_CELLS + 1), index.flatten().long()
+    weights = [torch.ones_like(places).double(), *(term.double().flatten() for term in terms)]
+    # not bincount, whose weights have no deterministic form on GPUs
+    empty = torch.zeros(size, dtype=torch.float64, device=index.device)
+    sums = torch.stack([empty.index_add(0, places, weight) for weight in weights], dim=-1)
     cells = sums.reshape(len(index), _CELLS + 1, -1)[:, :_CELLS].reshape(len(index), *_SIZES, -1)
     return torch.cat([cells.sum(dim=others) for others in ((2, 3), (1, 3), (1, 2))], dim=1)
 

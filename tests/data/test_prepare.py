@@ -374,6 +374,15 @@ def test_a_disk_too_small_is_refused_at_once(root: Path, cache: Path, monkeypatc
     assert not list(cache.glob("*.h5"))
 
 
+def test_a_limit_of_file_sizes_is_refused_at_once(root: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    resource = pytest.importorskip("resource")
+    source = write_set(root)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, 1024))
+    with pytest.raises(DataError, match=r"ulimit -f"):
+        prepare(source, size=SIZE, cache=cache)
+    assert not [path for path in cache.iterdir() if path.suffix != ".lock"]
+
+
 @pytest.mark.parametrize("kind", [OSError, RuntimeError])
 def test_a_full_disk_gives_one_line(
     root: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Exception]

@@ -300,3 +300,12 @@ def test_layout_is_as_documented(filled: tuple[Any, ...]) -> None:
         assert len(file["native/png"]) == file["native/end"][-1]
         assert sorted(file["records"]) == ["category", "frame", "id", "scene", "split"]
         assert json.loads(file.attrs["info"]) == {"source": "test"}
+
+
+def test_a_store_on_a_disk_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise BlockingIOError(11, "Unable to synchronously open file (unable to lock file, errno = 11)")
+
+    monkeypatch.setattr(h5py, "File", refuse)
+    with pytest.raises(DataError, match="HDF5_USE_FILE_LOCKING=FALSE"):
+        DepthStore(tmp_path / "a.h5")
