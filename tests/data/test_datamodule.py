@@ -334,3 +334,12 @@ def test_outdoor_depth_and_what_is_clipped(
     torch.testing.assert_close(batch["native_depth"][0][0], expected)
     unit = preprocess(batch, max_depth_m=max_depth_m)["unit_depth"][0, 0]
     torch.testing.assert_close(unit, (expected / max_depth_m).clamp(max=1))
+
+
+def test_a_set_that_is_all_test_does_not_train(tmp_path: Path) -> None:
+    data = DepthDataModule(
+        RoomsSource(scenes=2, frames_per_scene=2, size=(16, 16)), size=16, split="test", cache=tmp_path
+    )
+    assert len(data.split.test) == 4
+    with pytest.raises(DataError, match=r"data\.split=test"):
+        data.train_dataloader()

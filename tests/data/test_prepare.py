@@ -509,3 +509,20 @@ def test_a_file_that_cannot_grow_gives_one_line_and_no_crash(
         "",
     )
     assert [file.suffix for file in cache.iterdir()] == [".lock"]
+
+
+def test_no_reading_and_a_far_median_are_said(root: Path, cache: Path, lines: list[str]) -> None:
+    source = write_set(root)
+    for path in (root / "depths").iterdir():
+        depth = np.full(NATIVE, 12_500, np.uint16)  # 2.5 m as TUM stores it
+        depth[:3] = 65535
+        cv2.imwrite(str(path), depth)
+    store = prepare(source, size=SIZE, cache=cache)
+    assert store.info["no_reading"] == 0.25
+    assert store.info["depth_max_m"] == 12.5
+    assert any("25.0 %" in line and "data.invalid" in line for line in lines)
+    assert any("data.encoding=uint16_5000 (median 2.5 m)" in line for line in lines)
+    lines.clear()
+    said = FolderSource(root, encoding="linear", depth_scale_m=1 / 5000, invalid=[65535])
+    assert prepare(said, size=SIZE, cache=cache).info["depth_max_m"] == 2.5
+    assert len(lines) == 1
