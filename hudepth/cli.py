@@ -13,7 +13,7 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.options import plain
-from hudepth.base.verbs import SUBCOMMANDS, commands, module_of, options_of
+from hudepth.base.verbs import SUBCOMMANDS, commands, conf_folder, module_of, options_of
 from hudepth.base.wording import LAUNCHERS, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
@@ -25,6 +25,9 @@ PATHS = {
     "data.source.depths", "data.source.manifest", "paths.runs", "paths.sweeps", "paths.cache",
 }  # fmt: skip
 """Options that are paths or names: their values are text, whatever Hydra's grammar would make of them."""
+
+_WORD = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_][\w./-]*", re.IGNORECASE)
+"""A choice of a group: nothing that Hydra reads as a number or a constant."""
 
 
 def _main(task: str) -> int:
@@ -120,12 +123,16 @@ def _check_groups(arguments: list[str]) -> None:
     """
     for argument in arguments:
         group, _, name = argument.partition("=")
-        if name.startswith("[") and group != "protocol" and group.lstrip("+") not in ADDED_GROUPS and options_of(group):
-            choices = name.strip("[]")
-            one = choices.partition(",")[0].strip()
-            raise ConfigError(
-                f"{group}: takes one choice, not {name}. Pass {group}={one}, or sweep: -m {group}={choices}."
-            )
+        key = group.lstrip("+")
+        if name and not name.startswith("~") and (conf_folder() / key).is_dir() and not re.search(r"[()$]", name):
+            choices = name.strip("[]").split(",")
+            if not all(_WORD.fullmatch(each.strip()) for each in choices):
+                raise ConfigError(f"{key}: no '{name}'. Pass one of {', '.join(options_of(key))}.")
+            if name[0] == "[" and key not in ("protocol", *ADDED_GROUPS):
+                sweep = f"-m {group}={','.join(choices)}"
+                raise ConfigError(
+                    f"{group}: takes one choice, not {name}. Pass {group}={choices[0]}, or sweep: {sweep}."
+                )
         if group == "hydra/launcher" and name in LAUNCHERS:
             package = f"hydra_plugins.hydra_{name.partition('_')[0]}_launcher"
             if importlib.util.find_spec(package) is None:

@@ -30,6 +30,9 @@ from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
 
 _COUNT = Annotated[int, Range(1)]
+MAX_WORKERS = 1024
+"""Loader and preparing processes at most; more would only take the memory of the machine."""
+_WORKERS = Annotated[int, Range(1, MAX_WORKERS)]
 
 
 class DepthDataModule(LightningDataModule):
@@ -82,8 +85,8 @@ class DepthDataModule(LightningDataModule):
         self.seed: int = convert("data.seed", seed, int)
         self.max_depth_m: float = convert("data.max_depth_m", max_depth_m, Annotated[float, Range(0, above=True)])
         self.batch_size: int = convert("data.batch_size", batch_size, _COUNT)
-        self.num_workers: int = convert("data.num_workers", num_workers, Annotated[int, Range(0)])
-        self.prepare_workers: int | None = convert("data.prepare_workers", prepare_workers, _COUNT | None)
+        self.num_workers: int = convert("data.num_workers", num_workers, Annotated[int, Range(0, MAX_WORKERS)])
+        self.prepare_workers: int | None = convert("data.prepare_workers", prepare_workers, _WORKERS | None)
         self.shuffle_block: int | None = convert("data.shuffle_block", shuffle_block, _COUNT | None)
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.camera import Intrinsics
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import Broadcast, Choice, Range, convert
 from hudepth.data.rooms.fittings import CATEGORIES
 from hudepth.data.rooms.furnishing import VARIETIES
@@ -24,6 +24,7 @@ from hudepth.data.sources.base import RawPair, Record, Source
 RENDERER_VERSION = 1
 """Raise it whenever a change alters any frame: prepared data with another version is out of date."""
 
+MAX_PAIRS = 1_000_000
 _COUNT = Annotated[int, Range(1)]
 _SIZE = Annotated[tuple[int, int], Range(16, 2048), Broadcast(), "[height,width], each from 16 to 2048"]
 _TEST_FRACTION = 0.2
@@ -68,6 +69,10 @@ class RoomsSource(Source):
     ) -> None:
         self.scenes: int = convert("data.source.scenes", scenes, _COUNT)
         self.frames_per_scene: int = convert("data.source.frames_per_scene", frames_per_scene, _COUNT)
+        if self.scenes * self.frames_per_scene > MAX_PAIRS:
+            raise ConfigError(
+                f"data.source.scenes: {self.scenes} x {self.frames_per_scene} frames are over {MAX_PAIRS:,}."
+            )
         self.size: tuple[int, int] = convert("data.source.size", size, _SIZE)
         self.seed: int = convert("data.source.seed", seed, Annotated[int, Range(0)])
         self.variety: str = convert("data.source.variety", variety, Annotated[str, Choice(tuple(VARIETIES))])
