@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -14,6 +16,16 @@ LAUNCHERS = {
     "joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "submitit": "slurm", "ray": "ray",
 }  # fmt: skip
 """Ways to run the jobs of a sweep, and the extra of this package that installs each."""
+
+_FOLDER = "Pass a folder that you can write to."
+_FIXES = {
+    errno.ENOSPC: "Free some space, or pass a folder on another disk.",
+    errno.EDQUOT: "Free some of your quota, or pass a folder on another disk.",
+    errno.EFBIG: "Raise the limit of file sizes (ulimit -f), or pass a folder on another disk.",
+    errno.EROFS: _FOLDER, errno.EACCES: _FOLDER, errno.EPERM: _FOLDER, errno.ENOTDIR: _FOLDER,
+    errno.EIO: "Check the disk.",
+}  # fmt: skip
+"""What to do about a file that could not be written, by the system's number of the error."""
 
 
 def one_line(error: BaseException, task: str) -> str:
@@ -30,6 +42,10 @@ def one_line(error: BaseException, task: str) -> str:
     for cause in chain:
         if line := _config_line(cause, task):
             return line
+    for cause in chain:
+        if isinstance(cause, OSError) and cause.errno in _FIXES:
+            name = f"'{cause.filename}'" if cause.filename else "a file"
+            return f"{name} cannot be written ({os.strerror(cause.errno)}). {_FIXES[cause.errno]}"
     message = " ".join(str(error).split()) or type(error).__name__
     return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
 

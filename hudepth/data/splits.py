@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from hudepth.base.errors import ConfigError, DataError, did_you_mean
-from hudepth.base.files import write_json
+from hudepth.base.files import read_json, write_json
 from hudepth.data.sources.base import Record
 
 SUBSETS = ("train", "val", "test")
@@ -154,11 +154,11 @@ def load_split(path: Path, records: Sequence[Record]) -> Split:
     Raises DataError if the file is damaged, its hash does not fit its ids, or a pair it names is not there.
     """
     try:
-        saved = json.loads(path.read_text(encoding="utf-8"))
+        saved = read_json(path)
         ids: dict[str, list[str]] = {name: [str(i) for i in saved["ids"][name]] for name in SUBSETS}
         kind, seed, sha256 = str(saved["kind"]), int(saved["seed"]), str(saved["sha256"])
         train, val, test = (float(share) for share in saved["fractions"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise DataError(f"'{path}' is not a split.json ({type(error).__name__}: {error}).") from error
     if _hash(ids) != sha256:
         raise DataError(f"'{path}': its ids do not have the hash it states; it was edited. Restore it, or train again.")

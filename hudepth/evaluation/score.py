@@ -56,7 +56,7 @@ def score_checkpoint(
     """
     import_trusted(options.trust)
     protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
-    output_folder(output)
+    output_folder(output, within=checkpoint.run if checkpoint.run in output.parents else None)
     net = checkpoint.build_net(trust=options.trust)
     predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
     if options.baselines and not datamodule.split.train:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -30,6 +30,7 @@ from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
+from hudepth.runs.results import read_metrics
 
 OWN = [PT2, "onnx", "xml"]  # files made here are read without suspicion
 FORMATS = ("onnx", "torch_export", "openvino", "int8", "bundle")
@@ -116,7 +117,7 @@ def export(config: dict[str, Any]) -> None:
     info = replace(info, processing=options.processing)
     record: dict[str, Any] = {}
     try:
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=output) as folder:
+        with tempfile.TemporaryDirectory(prefix=f".export-{os.getpid()}-", dir=output) as folder:
             net = inference_form(net, size=info.size)
             work = Work(options, checkpoint, net, reference, info, images, output, Path(folder))
             for name in options.format:
@@ -179,7 +180,7 @@ def _bundle(work: Work) -> dict[str, Any]:
     samples = [model.predict(image) for image in images.compared[:: max(1, len(images.compared) // 3)][:3]]
     run = work.checkpoint.run
     files = sorted((run / "test").glob("*/metrics.json")) if run else []
-    results = {file.parent.name: json.loads(file.read_text(encoding="utf-8")) for file in files}
+    results = {file.parent.name: read_metrics(file) for file in files}
     folder = work.folder / name
     card = model_card(
         work.checkpoint, info, name=name, results=results, parity=str(parity), half=options.half,

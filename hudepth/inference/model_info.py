@@ -62,14 +62,19 @@ class ModelInfo:
         try:
             height, width = size or data["size"]
             native = checkpoint.data.get("native_sizes") or []
-            return cls(
-                name=str(checkpoint.config["model"].get("_target_", "")).rpartition(".")[2],
-                size=(int(height), int(width)),
-                max_depth_m=float(data["max_depth_m"]),
-                parameters=parameters,
-                epoch=checkpoint.epoch,
-                trained_on={**checkpoint.data, "split": checkpoint.split},
-                aspect=native[0][1] / native[0][0] if len(native) == 1 else USUAL_ASPECT,
-            )
-        except (TypeError, KeyError, ValueError, IndexError, ZeroDivisionError) as error:
+            values = {
+                "name": str(checkpoint.config["model"].get("_target_", "")).rpartition(".")[2],
+                "size": [int(height), int(width)],
+                "max_depth_m": float(data["max_depth_m"]),
+                "parameters": parameters,
+                "epoch": checkpoint.epoch,
+                "trained_on": {**checkpoint.data, "split": checkpoint.split},
+                "aspect": native[0][1] / native[0][0] if len(native) == 1 else USUAL_ASPECT,
+            }
+            return parse(cls, values, prefix="data." if size is None else "")
+        except ConfigError as error:
+            if size is not None:
+                raise
+            raise CheckpointError(f"'{checkpoint.path}' is refused: {error}") from error
+        except (TypeError, KeyError, ValueError, IndexError, ZeroDivisionError, OverflowError) as error:
             raise CheckpointError(f"'{checkpoint.path}' does not record what data it was trained on.") from error

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
+from hudepth.base.files import read_text
 from hudepth.metrics.catalogue import depth_names, metric_info
 
 Floats = NDArray[np.float64]
@@ -118,7 +119,7 @@ def read_per_image(path: Path) -> ImageTable:
     rows: dict[str, list[str]] = {}
     numbers: list[list[float]] = []
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with io.StringIO(read_text(path), newline="") as file:
             reader = csv.reader(file)
             names = next(reader, [])
             if tuple(names[: len(KEYS)]) != KEYS or len(set(names)) != len(names) or len(names) == len(KEYS):

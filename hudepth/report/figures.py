@@ -39,7 +39,7 @@ def draw_figures(options: FiguresOptions) -> None:
     if not is_run(run):
         raise ConfigError(f"run: '{run}' is not a run directory. Pass run=<runs/name/date_time>, or run=last.")
     history = read_history(run / "metrics.csv")
-    output = output_folder(options.output or run / "figures")
+    output = output_folder(options.output or run / "figures", within=None if options.output else run)
     save_figure(output / "curves.png", draw_curves(history, title=f"{run.parent.name}: loss and raw terms"))
     log.info("total loss and its terms by epoch: %s", (output / "curves.png").resolve())
     if not options.panels:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hudepth.base.console import log
-from hudepth.base.errors import ConfigError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import output_folder, write_text
 from hudepth.base.tables import Table, stdout
 from hudepth.metrics.bootstrap import intervals
@@ -69,13 +69,21 @@ def _results(runs: Sequence[Path], protocols: Sequence[str]) -> dict[str, Result
     # the name of a run directory is a date; the folder above it names the run
     short = [run.resolve().parent.name if (run / CHECKPOINTS).is_dir() else run.resolve().name for run in runs]
     found: dict[str, Result] = {}
+    troubles: list[DataError] = []
     for run, name in zip(runs, short, strict=True):
         full = name if short.count(name) == 1 else f"{name}/{run.resolve().name}"
         for protocol in protocols:
             key = full if len(protocols) == 1 else f"{full}, {protocol}"
             if key in found:
                 raise ConfigError(f"runs: two are called '{full}'. Pass each once, or rename a folder.")
-            found[key] = find_result(run, protocol)
+            try:
+                found[key] = find_result(run, protocol)
+            except DataError as error:  # one damaged run does not end the table
+                troubles.append(error)
+    if not found:
+        raise troubles[0]
+    for trouble in troubles:
+        log.warning("left out: %s", trouble)
     return found
 
 

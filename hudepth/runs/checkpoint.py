@@ -17,6 +17,7 @@ from hudepth.base.files import written_whole
 from hudepth.models.build import build_network
 from hudepth.runs import bundles
 from hudepth.runs.run import best_checkpoint, find_run, is_run, newest_run
+from hudepth.runs.sections import check_config
 
 KEY = "hudepth"
 """Where a Lightning checkpoint keeps what hudepth adds: format version, configuration, split."""
@@ -180,6 +181,7 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
     mappings = all(isinstance(part, dict) for part in parts) and isinstance(config.get("model"), dict)
     if not (mappings and isinstance(epoch, int) and _is_state(tensors)):
         raise CheckpointError(f"'{path}' is incomplete: configuration, split, data, epoch or tensors are missing.")
+    check_config(config, where=path)
     state = {n.removeprefix(NET_PREFIX): v for n, v in tensors.items() if n.startswith(NET_PREFIX)}
     return Checkpoint(path, run, config, split, data, epoch, state, size_bytes)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hudepth.base.errors import DataError
-from hudepth.base.files import write_text
+from hudepth.base.files import read_text, write_text
 
 FILE = "metrics.csv"
 WHOLE_NUMBERS = ("epoch", "step")
@@ -28,8 +28,8 @@ def write_history(path: Path, rows: Sequence[Mapping[str, float]]) -> None:
 def read_history(path: Path) -> list[dict[str, float]]:
     """Read a run's metrics.csv: one row per epoch. Raises DataError if it is missing or holds no epoch."""
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+        lines = io.StringIO(read_text(path), newline="")
+        rows = [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(lines)]
     except (OSError, ValueError, TypeError, csv.Error) as error:  # TypeError: a row with more values than names
         raise DataError(f"'{path}' cannot be read as a history of epochs ({error}).") from error
     if not all("epoch" in row for row in rows):

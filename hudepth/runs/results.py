@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hudepth.base.errors import DataError, did_you_mean
+from hudepth.base.files import read_json
 from hudepth.metrics.summary import ImageTable, read_per_image, summarise
 
 METRICS, PER_IMAGE = "metrics.json", "per_image.csv"
@@ -16,6 +18,8 @@ MODEL = "model"
 """Name of the network among the predictors in metrics.json."""
 CHECKED = ("abs_rel", "rmse")
 """Metrics that must agree between per_image.csv and metrics.json."""
+LARGEST = 1e12
+"""No metric of a depth network is larger; sums of such numbers stay finite."""
 _AGAIN = "Run hudepth-test again."
 _NEEDED = (
     "images", "protocol.name", "protocol.averaging", "protocol.silog.lambda", "protocol.silog.factor",
@@ -91,8 +95,8 @@ def find_result(run_or_folder: str | Path, protocol: str) -> Result:
 def read_metrics(file: Path) -> dict[str, Any]:
     """Read a metrics.json, which has at least metrics of the network. Raises DataError if it is missing or damaged."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        document = read_json(file)
+    except (OSError, ValueError) as error:
         raise DataError(f"'{file}' cannot be read ({error}). {_AGAIN}") from error
     if not isinstance(_at(document, f"metrics.{MODEL}"), dict):
         raise DataError(f"'{file}' is not a test result: it has no metrics.{MODEL}. {_AGAIN}")
@@ -114,6 +118,10 @@ def _read(folder: Path) -> Result:
         metrics, averaging = result.metrics, result.averaging
     except (AttributeError, TypeError, ValueError) as error:
         raise DataError(f"'{path}' is not a test result ({error}). {_AGAIN}") from error
+    finite = ((name, np.nan_to_num(each, posinf=0, neginf=0)) for name, each in result.table.values.items())
+    numbers = [*metrics.items(), *finite]
+    if large := next((name for name, value in numbers if np.any(np.abs(value) > LARGEST)), None):
+        raise DataError(f"'{path}' is not a test result: its {large} is beyond {LARGEST:g}. {_AGAIN}")
     count = len(result.table.ids)
     if count != document["images"]:
         raise DataError(f"'{per_image}' has {count} images, but {METRICS} states {document['images']}. {_AGAIN}")

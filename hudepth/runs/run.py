@@ -14,6 +14,7 @@ from hudepth.base.files import read_yaml
 from hudepth.runs.history import read_history
 from hudepth.runs.identity import run_key
 from hudepth.runs.results import Result, find_result
+from hudepth.runs.sections import check_config
 from hudepth.runs.status import read_state
 
 CHECKPOINTS = "checkpoints"
@@ -41,6 +42,7 @@ class Run:
         if missing := [part for part in ("seed", "data", "model", "loss") if part not in config]:
             why = f"its config.yaml has no '{missing[0]}'"
             raise CheckpointError(f"'{path}' is not a run of hudepth-train: {why}. Pass a run directory.")
+        check_config(config, where=path / "config.yaml")
         return cls(path, config, *read_state(path), labels=dict(labels or {}))
 
     @property

@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +25,7 @@ import yaml
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import write_json, write_text
+from hudepth.base.files import read_json, read_text, write_json, write_text
 
 SCORED = "scored.json"
 
@@ -64,10 +63,11 @@ def write_resumed(run: Path, *, config: Mapping[str, Any], overrides: Sequence[s
     """Write config.yaml again and append to overrides.txt. Raises ConfigError if the folder cannot be written."""
     file = run / "overrides.txt"
     try:
-        earlier = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+        earlier = read_text(file).splitlines() if file.is_file() else []
         _write_config(run, config, [*earlier, *overrides])
-    except OSError as error:
-        raise ConfigError(f"'{run}' cannot be written ({error.strerror}), so the run cannot be resumed.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"'{run}' cannot be written ({why}), so the run cannot be resumed.") from error
 
 
 def _write_config(run: Path, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
@@ -121,8 +121,9 @@ def note_scored(run: Path, *, epoch: int, data: str, split: str, protocols: Sequ
 def read_scored(run: Path) -> list[dict[str, Any]]:
     """Return the recorded evaluations of a run on test images; empty if scored.json is missing or damaged."""
     try:
-        entries = json.loads((run / SCORED).read_text(encoding="utf-8"))
+        entries = read_json(run / SCORED)
     except (OSError, ValueError):
         return []
     keys = {"time", "epoch", "data", "split", "protocols"}
-    return [e for e in entries if isinstance(e, dict) and keys <= e.keys()] if isinstance(entries, list) else []
+    whole = [e for e in entries if isinstance(e, dict) and keys <= e.keys()] if isinstance(entries, list) else []
+    return [e for e in whole if isinstance(e["epoch"], int) and not isinstance(e["epoch"], bool)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import write_json
+from hudepth.base.files import read_json, remove_leftovers, write_json
 
 FINISHED, FAILED, PRUNED, INTERRUPTED, RUNNING = "finished", "failed", "pruned", "interrupted", "running"
 LOCK = ".lock"
@@ -44,8 +43,8 @@ def write_status(run: Path, state: str, **more: Any) -> None:
 def read_status(run: Path) -> dict[str, Any]:
     """Read status.json as it is; empty if it is missing or damaged."""
     try:
-        status = json.loads((run / "status.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        status = read_json(run / "status.json")
+    except (OSError, ValueError):
         return {}
     return status if isinstance(status, dict) else {}
 
@@ -92,6 +91,7 @@ def lock_run(run: Path, *, timeout_s: float = 0) -> Iterator[None]:
     except OSError as error:
         raise ConfigError(f"'{run}' cannot be written ({error.strerror}). Pass a folder you can write to.") from error
     try:
+        remove_leftovers(run)
         yield
     finally:
         lock.release()

@@ -25,6 +25,7 @@ from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.environment import environment
 from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
 from hudepth.runs.run import CHECKPOINTS, LAST, read_config
+from hudepth.runs.sections import check_config, check_resumable
 from hudepth.runs.status import lock_run, write_status
 from hudepth.training.fit import fit
 from hudepth.training.initial import Training
@@ -90,7 +91,8 @@ def resumed_config(path: Path, overrides: list[str]) -> dict[str, Any]:
     last = path / CHECKPOINTS / LAST
     if not last.is_file():
         raise CheckpointError(f"resume: '{path}' has no finished epoch to resume from. Train again without resume=.")
-    read_plain(last)
+    check_config(config, where=path / "config.yaml")
+    check_resumable(read_plain(last), where=last)
     epochs = config["trainer"].get("max_epochs")
     resumed = OmegaConf.create({**config, "trust": []})
     for override in overrides:

@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
-from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
 from hudepth.base.instantiate import has_target, import_trusted, instantiate
 from hudepth.base.machine import keep_freed_memory
 from hudepth.base.options import parse
@@ -26,7 +26,7 @@ from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
-from hudepth.runs.checkpoint import load_checkpoint
+from hudepth.runs.checkpoint import load_checkpoint, read_plain
 from hudepth.training.initial import Parents, Training, restore_parents
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
@@ -165,6 +165,15 @@ def run_epochs(training: Training, trainer: Trainer, module: DepthModule, data: 
     if training.overrides is not None and is_first_process():
         run_dir.write_resumed(training.path, config=training.config, overrides=training.overrides)
     with without_known_warnings():
-        trainer.fit(module, datamodule=data, ckpt_path=last, weights_only=True)
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=last, weights_only=True)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            steps = read_plain(last).get("global_step") if last else None
+            if trainer.global_step not in (0, steps) or last is None:
+                raise
+            why = (str(error).splitlines() or [""])[0][:200]  # torch and Lightning fail in many ways on foreign states
+            raise CheckpointError(
+                f"'{last}' does not fit this training ({type(error).__name__}: {why}). Train again without resume=."
+            ) from error
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()  # one process tests: it should not wait for the others

@@ -11,10 +11,22 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.base.files import write_between, write_json, write_text, written_whole
+from hudepth.base.errors import ConfigError
+from hudepth.base.files import (
+    output_folder,
+    read_json,
+    read_text,
+    read_yaml,
+    remove_leftovers,
+    write_between,
+    write_json,
+    write_text,
+    written_whole,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -130,3 +142,58 @@ def test_writing_between_markers_leaves_the_rest(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8") == expected
     with pytest.raises(ValueError, match=r"needs two lines '<!-- c -->' and has 0\.$"):
         write_between(path, "c", "x")
+
+
+def test_only_regular_files_are_read_and_only_so_much(tmp_path: Path) -> None:
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("zero", "pipe"):
+        with pytest.raises(OSError, match="regular"):
+            read_text(tmp_path / name)
+    (tmp_path / "long").write_text("x" * 11)
+    with pytest.raises(OSError, match="larger"):
+        read_text(tmp_path / "long", limit=10)
+
+
+def test_deep_and_multiplying_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_text("[" * 200_000 + "]" * 200_000)
+    with pytest.raises(ValueError, match="deep"):
+        read_json(path)
+    laughs = "\n".join([f"a0: &a0 [{'x,' * 9}]", *(f"a{i}: &a{i} [{f'*a{i - 1},' * 9}]" for i in range(1, 12))])
+    for text in ("[" * 200_000, laughs, "&a [*a]"):
+        path.write_text(text)
+        with pytest.raises(yaml.YAMLError):
+            read_yaml(path)
+    path.write_text("2024-13-45")
+    with pytest.raises(yaml.YAMLError, match="month"):
+        read_yaml(path)
+
+
+def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        ended.wait()
+    (tmp_path / "eigen").mkdir()
+    dead = [tmp_path / f".a.json.{ended.pid}.part", tmp_path / "eigen" / f".b.png.{ended.pid}.part"]
+    kept = [tmp_path / f".a.json.{os.getpid()}.part", tmp_path / ".hidden", tmp_path / "x.part"]
+    for path in (*dead, *kept):
+        path.write_text("x")
+    folder = tmp_path / f".export-{ended.pid}-abc"
+    (folder / "deep").mkdir(parents=True)
+    remove_leftovers(tmp_path)
+    assert not any(path.exists() for path in (*dead, folder))
+    assert all(path.exists() for path in kept)
+
+
+def test_a_link_out_of_a_run_is_refused(tmp_path: Path) -> None:
+    run, other = tmp_path / "run", tmp_path / "other"
+    run.mkdir()
+    other.mkdir()
+    (run / "figures").symlink_to(other)
+    (run / "test").mkdir()
+    (run / "test" / "eigen").symlink_to(other)
+    for name in ("figures", "test"):
+        with pytest.raises(ConfigError, match="leads out"):
+            output_folder(run / name, within=run)
+    assert not list(other.iterdir())
+    assert output_folder(run / "figures") == run / "figures"  # as typed

@@ -95,7 +95,7 @@ def test_the_folder_of_another_protocol(study: Path) -> None:
     [
         ("{", r"cannot be read \(Expecting property name .*\)\."),
         ("\xff", r"cannot be read \('utf-8' codec .*\)\."),
-        ("[" * 100_000, r"cannot be read \(maximum recursion depth .*\)\."),
+        ("[" * 100_000, r"cannot be read \(nested too deep\)\."),
         ("[]", r"is not a .* no metrics\.model\."),
         ('{"metrics": {"model": {}}}', r"is not a .* no images\."),
         ('{"metrics": {"mean_depth": {}}}', r"is not a .* no metrics\.model\."),
@@ -142,3 +142,8 @@ def test_a_table_that_is_missing_or_of_another_test(study: Path) -> None:
     assert message(lambda: find_result(study, "eigen")).startswith(f"'{table}', line 2: pixels 'many'")
     table.unlink()
     assert "no per_image.csv" in message(lambda: find_result(study, "eigen"))
+
+
+def test_metrics_beyond_reason(study: Path) -> None:
+    edit(study / "test" / "eigen", lambda document: document["metrics"]["model"].update(mae=1e308))
+    assert "mae" in message(lambda: find_result(study, "eigen"))

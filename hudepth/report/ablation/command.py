@@ -61,7 +61,7 @@ def report_sweep(options: SweepOptions) -> None:
     for line in [*report.warnings, *sweep.notes]:
         log.warning("%s", line)
     print_table(report)
-    _write(report, sweep, output_folder(output), options)
+    _write(report, sweep, output_folder(output, within=None if options.output else options.dir), options)
     log.info("page, tables and pictures: %s", (output / "report.html").resolve())
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from hudepth.base.errors import HudepthError
+from hudepth.base.files import read_json
 from hudepth.metrics.bootstrap import REPEATS, SEED, Draws, Resampler, describe
 from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.report.ablation.estimates import contrast, estimate
@@ -147,7 +147,7 @@ def _versions_of(table: Sequence[Row]) -> dict[str, list[str]]:
     versions: dict[str, list[str]] = {}
     for run in (each.run.path for row in table for each in row.runs.values()):
         try:
-            found = json.loads((run / "environment.json").read_text(encoding="utf-8"))["packages"]["hudepth"]
+            found = read_json(run / "environment.json")["packages"]["hudepth"]
         except (OSError, ValueError, RecursionError, KeyError, TypeError):
             found = None
         versions.setdefault(found if isinstance(found, str) else "unknown", []).append(run.name)
