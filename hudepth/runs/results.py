@@ -119,7 +119,7 @@ def _read(folder: Path) -> Result:
     except (AttributeError, TypeError, ValueError) as error:
         raise DataError(f"'{path}' is not a test result ({error}). {_AGAIN}") from error
     finite = ((name, np.nan_to_num(each, posinf=0, neginf=0)) for name, each in result.table.values.items())
-    numbers = [*metrics.items(), *finite]
+    numbers: list[tuple[str, Any]] = [*metrics.items(), *finite]
     if large := next((name for name, value in numbers if np.any(np.abs(value) > LARGEST)), None):
         raise DataError(f"'{path}' is not a test result: its {large} is beyond {LARGEST:g}. {_AGAIN}")
     count = len(result.table.ids)
