@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import warnings
@@ -78,10 +79,12 @@ def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
 def export_program(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
     """Write a ``torch.export`` program (``.pt2``) for any batch size, whole or not at all; see :func:`export_onnx`."""
     graph, image = export_graph(net, info)
-    with _quiet(), torch.no_grad(), written_whole(path) as part:
+    memory = io.BytesIO()  # not the file: torch ends the process if the disk is full
+    with _quiet(), torch.no_grad():
         program = torch.export.export(graph, (image,), dynamic_shapes=({0: torch.export.Dim("batch", min=1)},))
-        with part.open("wb") as file:
-            torch.export.save(program, file, extra_files={f"{KEY}.json": info.to_json()})
+        torch.export.save(program, memory, extra_files={f"{KEY}.json": info.to_json()})
+    with written_whole(path) as part:
+        part.write_bytes(memory.getbuffer())
 
 
 def export_openvino(onnx: Path, path: Path, *, info: ModelInfo) -> None:
