@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -148,6 +149,31 @@ def test_lists_quotes_interpolations_and_sweeps_of_paths_stay(tmp_path: Path, mo
 
 def test_several_choices_of_a_group_are_refused(command: Command) -> None:
     assert "hudepth-train: loss: takes one choice" in command("train", "loss=[l1,silog]").err
+
+
+@pytest.mark.parametrize("value", ["-1.5", "null", "true", "[[1]]", "[null]", "{a:1}", "nan"])
+@pytest.mark.parametrize("group", ["model", "+optim", "protocol", "paths"])
+def test_what_is_no_name_is_no_choice_of_a_group(group: str, value: str, command: Command) -> None:
+    done = command("test", "checkpoint=nyu", f"{group}={value}")
+    assert done.code == 1
+    assert re.match(rf"hudepth-test: {group.lstrip('+')}: no '", done.err.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("paths.runs=[null]", "paths"),
+        ("distill._target_=x", "distill.teacher"),
+        ("data.num_workers=100000", "data.num_workers"),
+        ("data.source.scenes=1000000000", "data.source.scenes"),
+        ("data.batch_size=99999999999999999999", "data.batch_size"),
+    ],
+)
+def test_values_beyond_reason_are_refused_by_their_key(override: str, key: str, command: Command) -> None:
+    done = command("train", override)
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith(f"hudepth-train: {key}")
+    assert "debug=true" not in done.err
 
 
 def test_rewrite_refuses_an_unknown_verb() -> None:

@@ -75,6 +75,8 @@ def build_datamodule(training: Training) -> DepthDataModule:
     """Prepare the data, and check the protocols of the final test while nothing is lost yet."""
     config, trust = training.config, training.options.trust
     distill = config.get("distill") or {}
+    if has_target(distill) and not distill.get("teacher"):
+        raise ConfigError("distill.teacher is not set. Pass distill.teacher=<folder of depths>, or distill=none.")
     teacher = {"teacher": distill["teacher"]} if has_target(distill) else {}
     data = build_data({**config["data"], **teacher}, trust=trust, augment=config.get("augment"))
     if data.source.name == "rooms":

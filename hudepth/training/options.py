@@ -76,6 +76,7 @@ class TrainOptions:
     compile: bool = False
     variant: str | None = None
     sweep_dir: str | None = None
+    paths: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", self.name) or ".." in self.name.split("/"):
