@@ -174,7 +174,9 @@ def _convert(key: str, value: Any, hint: Any, marks: tuple[Any, ...]) -> Any:
     if origin in (dict, Mapping) or is_dataclass(hint):
         if not isinstance(value, Mapping):
             raise _MismatchError
-        return parse(hint, value, prefix=f"{key}.") if isinstance(hint, type) and is_dataclass(hint) else value
+        if isinstance(hint, type) and is_dataclass(hint):
+            return parse(hint, value, prefix=f"{key}.")
+        return {name: convert(f"{key}.{name}", each, args[1]) for name, each in value.items()} if args else value
     return _convert_scalar(value, hint, marks)
 
 
