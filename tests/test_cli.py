@@ -163,6 +163,7 @@ def test_what_is_no_name_is_no_choice_of_a_group(group: str, value: str, command
     ("override", "key"),
     [
         ("paths.runs=[null]", "paths"),
+        ("protocol.paper=-1", "protocol.paper"),
         ("distill._target_=x", "distill.teacher"),
         ("data.num_workers=100000", "data.num_workers"),
         ("data.source.scenes=1000000000", "data.source.scenes"),

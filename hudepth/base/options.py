@@ -49,9 +49,6 @@ class Choice:
     names: Sequence[str]
 
 
-_LARGEST_INT = 2**63 - 1
-
-
 class Broadcast:
     """Marks a tuple for which a single value stands for all: ``size=224`` for ``size=[224,224]``."""
 
@@ -189,7 +186,7 @@ def _convert_scalar(value: Any, hint: Any, marks: tuple[Any, ...]) -> Any:
     if hint is Any or (hint is bool and isinstance(value, bool)):
         return value
     if number and all(mark.holds(value) for mark in marks if isinstance(mark, Range)):
-        if hint is int and isinstance(value, int) and abs(value) <= _LARGEST_INT:
+        if hint is int and isinstance(value, int) and abs(value) < 2**63:
             return value
         if hint is float and abs(value) < math.inf:
             return float(value)
