@@ -35,6 +35,11 @@ MAX_WORKERS = 1024
 _WORKERS = Annotated[int, Range(1, MAX_WORKERS)]
 
 
+def epoch_seed(purpose: str, seed: int, epoch: int, rank: int) -> int:
+    """Return a seed that depends on these alone, so that a resumed run draws what it would have drawn."""
+    return int.from_bytes(hashlib.sha256(f"{purpose} {seed} {epoch} {rank}".encode()).digest()[:7])
+
+
 class DepthDataModule(LightningDataModule):
     """Batches of image, unit depth and valid mask. Raises ConfigError for values out of range.
 
@@ -189,8 +194,7 @@ class DepthDataModule(LightningDataModule):
         assert self.trainer is not None
         epoch, rank = self.trainer.current_epoch, self.trainer.global_rank
         if self._draws is None or self._draws[0] != epoch:
-            seed = int.from_bytes(hashlib.sha256(f"augment {self.seed} {epoch} {rank}".encode()).digest()[:7])
-            self._draws = (epoch, torch.Generator().manual_seed(seed))
+            self._draws = (epoch, torch.Generator().manual_seed(epoch_seed("augment", self.seed, epoch, rank)))
         return self._draws[1]
 
     def _evaluation_loader(self, dataset: StoreDataset) -> DataLoader[RawBatch]:

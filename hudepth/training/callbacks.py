@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from hudepth.base.console import duration, log
+from hudepth.data.datamodule import epoch_seed
 from hudepth.data.store import DepthStore
 from hudepth.evaluation.pictures import make_panels
 from hudepth.runs.history import write_history
@@ -59,6 +61,18 @@ class History(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the rows from a checkpoint."""
         self.rows = [dict(row) for row in state_dict["rows"]]
+
+
+class EpochSeed(Callback):
+    """Seeds PyTorch each epoch: a network with dropout goes on after a resume as if it had never stopped."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Seed at the first batch, each process differently; Lightning skips the epoch's own hook after a resume."""
+        if batch_idx == 0:
+            torch.manual_seed(epoch_seed("train", self.seed, trainer.current_epoch, trainer.global_rank))
 
 
 class EpochLine(Callback):

@@ -45,6 +45,10 @@ class FreezeEncoder(Callback):
             raise ConfigError("FreezeEncoder.until: a share of the epochs needs trainer.max_epochs; or pass until=1.")
         _encoder(pl_module).freeze(len(self.stages))
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Freeze as in the epoch that is resumed: Lightning skips the hook below in the first one after a resume."""
+        self.on_train_epoch_start(trainer, pl_module)
+
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Train the stages again, if it is time."""
         if self.until < 1:

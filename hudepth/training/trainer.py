@@ -19,7 +19,7 @@ from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.pictures import evenly_spaced
 from hudepth.runs import history
 from hudepth.runs.checkpoint import AtomicCheckpointIO
-from hudepth.training.callbacks import EpochLine, History, Interrupt, PanelPictures
+from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, PanelPictures
 from hudepth.training.checkpointing import FullSizeEarlyStopping, checkpoint_callbacks
 from hudepth.training.loggers import drop_on_failure
 from hudepth.training.study import TRIAL_ENV, TrialPruner
@@ -30,7 +30,8 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
     """Build the callbacks of a run in a directory: history before checkpoints, which hold it."""
     options, monitor, mode = config["callbacks"], config["monitor"], config["mode"]
     callbacks: list[Callback] = [
-        Interrupt(), History(path / history.FILE), Times(path / "times.csv"), EpochLine(monitor)
+        Interrupt(), EpochSeed(config["seed"]), History(path / history.FILE), Times(path / "times.csv"),
+        EpochLine(monitor),
     ]  # fmt: skip
     if options["panels"]:
         indices = evenly_spaced(sorted(datamodule.split.val), options["panels"])

@@ -106,6 +106,7 @@ def test_a_log_file_on_a_full_disk_gives_up_with_one_warning(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     (tmp_path / "train.log").symlink_to("/dev/full")
+    capsys.readouterr()
     with run_dir.log_to_file(tmp_path / "train.log"):
         for _ in range(3):
             log.warning("a line")

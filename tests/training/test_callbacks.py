@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import signal
+import sys
 import weakref
 from collections.abc import Sequence
 from functools import partial
@@ -31,7 +32,7 @@ from hudepth.models import TinyUNet
 from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
 from hudepth.runs.history import read_history
 from hudepth.training import callbacks
-from hudepth.training.callbacks import EpochLine, History, Interrupt, PanelPictures
+from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, PanelPictures
 from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 from hudepth.viz.panels import Panel
@@ -114,6 +115,23 @@ def test_history_survives_a_resume(workers: int, data: DepthDataModule, tmp_path
     assert (broken / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     ours, theirs = (read_plain(run / "checkpoints" / "last.ckpt")["state_dict"] for run in (broken, whole))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+class Dropped(TinyUNet):
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return super().forward(torch.nn.functional.dropout2d(image, 0.3, self.training))
+
+
+def test_a_network_with_dropout_resumes_as_if_it_had_never_stopped(
+    data: DepthDataModule, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "TinyUNet", Dropped)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    fit(data, whole, [EpochSeed(1)], max_epochs=3)
+    torch.manual_seed(99)
+    fit(data, broken, [EpochSeed(1)], max_epochs=2)
+    fit(data, broken, [EpochSeed(1)], max_epochs=3, resume=True)
+    assert (broken / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
 
 
 def test_history_of_a_resumed_run_is_mended_before_it_goes_on(data: DepthDataModule, tmp_path: Path) -> None:
