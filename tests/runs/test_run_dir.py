@@ -103,9 +103,11 @@ def test_log_lines_go_to_the_file_while_it_lasts(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_log_file_on_a_full_disk_gives_up_with_one_warning(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "train.log").symlink_to("/dev/full")
+    monkeypatch.setattr(log, "handlers", [])
+    monkeypatch.setattr(logging.getLogger("lightning.pytorch"), "handlers", [])
     capsys.readouterr()
     with run_dir.log_to_file(tmp_path / "train.log"):
         for _ in range(3):
