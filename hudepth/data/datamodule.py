@@ -20,7 +20,7 @@ from hudepth.base.errors import DataError
 from hudepth.base.options import Range, Size, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
-from hudepth.data.dataset import BlockShuffle, ShardSampler, StoreDataset, as_is
+from hudepth.data.dataset import BlockShuffle, LateLoader, ShardSampler, StoreDataset, as_is
 from hudepth.data.prepare import OnError, prepare, share_beyond
 from hudepth.data.preprocess import preprocess
 from hudepth.data.resolution import read_stages, size_at
@@ -136,18 +136,13 @@ class DepthDataModule(LightningDataModule):
             )
         rank, world_size = self._shard()
         dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
-        sampler: DistributedSampler[RawBatch] | BlockShuffle
+        # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees the same order.
         if self.shuffle_block is None:
-            sampler = DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed)
-        else:
-            sampler = BlockShuffle(
-                dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
-                read_ahead=self.store.read_ahead,
-            )  # fmt: skip
-        if self.trainer is not None:
-            # The order depends on seed and epoch alone, so a resumed run sees the same. Lightning sets the epoch of a
-            # resumed run's first loader only once its processes have begun to read.
-            sampler.set_epoch(self.trainer.fit_loop.epoch_progress.current.processed)  # type: ignore[attr-defined]
+            return self._loader(dataset, DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed))
+        sampler = BlockShuffle(
+            dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
+            read_ahead=self.store.read_ahead,
+        )  # fmt: skip
         return self._loader(dataset, sampler)
 
     def val_dataloader(self) -> DataLoader[RawBatch]:
@@ -202,7 +197,7 @@ class DepthDataModule(LightningDataModule):
         return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size))
 
     def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
-        return DataLoader(
+        return LateLoader(
             dataset,
             self.batch_size,
             sampler=sampler,

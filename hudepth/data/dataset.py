@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from hudepth.base.types import RawBatch
 from hudepth.data.store import DepthStore
@@ -44,6 +44,18 @@ class StoreDataset(Dataset[RawBatch]):
         if self.teacher is not None:
             batch["teacher_m"] = torch.from_numpy(self.teacher.read(rows))
         return batch
+
+
+class LateLoader(DataLoader[RawBatch]):
+    """A DataLoader whose processes start at the first batch, not at ``iter``.
+
+    Lightning calls ``iter`` before it restores a run and sets the sampler's epoch; processes would already be reading
+    in the order of epoch 0.
+    """
+
+    def __iter__(self) -> Iterator[RawBatch]:  # type: ignore[override]  # Lightning only calls next
+        """Yield the batches."""
+        yield from super().__iter__()
 
 
 def as_is(batch: Any) -> Any:

@@ -207,10 +207,7 @@ RECIPE = (
     [
         ("schedule=cosine",),
         RECIPE,
-        pytest.param(
-            (*RECIPE, "data.num_workers=2", "trainer.accumulate_grad_batches=2"),
-            marks=pytest.mark.xfail(reason="workers, the recipe and accumulation together do not resume exactly yet"),
-        ),
+        (*RECIPE, "data.num_workers=2", "trainer.accumulate_grad_batches=2"),
     ],
     ids=["plain", "strong", "workers"],
 )
