@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from hudepth import __version__
 from hudepth.base.files import written_whole
 from hudepth.inference.backends import DepthPipeline
-from hudepth.inference.model_info import KEY, ModelInfo
-from hudepth.inference.runtimes import package
+from hudepth.inference.model_info import ModelInfo
+from hudepth.inference.runtimes import KEY, package
 
 OPSET = 18
 INPUT = "image"

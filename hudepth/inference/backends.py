@@ -15,8 +15,15 @@ from torch import Tensor, nn
 
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.normalise import NormaliseBytes
-from hudepth.inference.model_info import KEY, ModelInfo
-from hudepth.inference.runtimes import onnx_session, openvino_model, package
+from hudepth.inference.model_info import ModelInfo
+from hudepth.inference.runtimes import (
+    KEY,
+    onnx_description,
+    onnx_session,
+    openvino_description,
+    openvino_model,
+    package,
+)
 from hudepth.inference.trial import try_graph
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint
@@ -91,6 +98,13 @@ class GraphBackend:
         return np.maximum(unit_depth[:, 0] * np.float32(self.info.max_depth_m), np.float32(0))
 
 
+def _read_info(path: Path, text: str) -> ModelInfo:
+    if not text:
+        why = "its size and units are unknown. Export a checkpoint with hudepth-export."
+        raise CheckpointError(f"'{path}' was not exported by hudepth: {why}")
+    return ModelInfo.from_json(text, where=f"'{path}'")
+
+
 def _check_fits(path: Path, info: ModelInfo, found: dict[str, Any]) -> None:
     """Refuse a graph that takes or returns something else than its description says."""
     height, width = info.size
@@ -130,7 +144,9 @@ def open_exported(
     if backend != "torch":
         package(backend, extra="onnx" if backend == "onnxruntime" else backend)  # in this process, for its message
     suffix = path.suffix[1:].lower()
-    found = None if suffix in trust else try_graph(path, backend=backend, threads=threads)
+    if suffix not in trust:
+        found = try_graph(path, backend=backend, threads=threads)
+        _check_fits(path, _read_info(path, found["description"]), found)
     try:
         if backend == "torch":
             text, compute = _open_program(path)
@@ -144,13 +160,7 @@ def open_exported(
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         message = f"'{path}' cannot be read as a model: it is damaged or of another kind ({reason})."
         raise CheckpointError(message) from error
-    if not text:
-        why = "its size and units are unknown. Export a checkpoint with hudepth-export."
-        raise CheckpointError(f"'{path}' was not exported by hudepth: {why}")
-    info = ModelInfo.from_json(text, where=f"'{path}'")
-    if found is not None:
-        _check_fits(path, info, found)
-    return GraphBackend(backend, info, compute)
+    return GraphBackend(backend, _read_info(path, text), compute)
 
 
 Opened = tuple[str, Callable[[NDArray[Any]], NDArray[Any]]]  # description as JSON ("" if none), and what runs it
@@ -170,12 +180,9 @@ def _open_program(path: Path) -> Opened:
 def _open_onnx(path: Path, threads: int) -> Opened:
     session = onnx_session(path, threads=threads)
     name = session.get_inputs()[0].name
-    text = session.get_modelmeta().custom_metadata_map.get(KEY, "")
-    return text, lambda images: session.run(None, {name: images})[0]
+    return onnx_description(session), lambda images: session.run(None, {name: images})[0]
 
 
 def _open_openvino(path: Path, threads: int, precision: str) -> Opened:
     model, request = openvino_model(path, threads=threads, precision=precision)
-    places = ([KEY], ["framework", KEY])  # in an IR, in a model read from ONNX
-    text = next((str(model.get_rt_info(place).astype(str)) for place in places if model.has_rt_info(place)), "")
-    return text, lambda images: np.array(request.infer({0: images}, share_inputs=True)[0])
+    return openvino_description(model), lambda images: np.array(request.infer({0: images}, share_inputs=True)[0])

@@ -11,8 +11,7 @@ from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import Range, parse
 from hudepth.runs.checkpoint import Checkpoint
 
-VERSION = 1  # of the description; exported files carry it as JSON under KEY
-KEY = "hudepth"
+VERSION = 1  # of the description that exported files carry
 USUAL_ASPECT = 4 / 3  # width over height if a checkpoint does not record it: that of NYU Depth V2 and most sensors
 MAX_SIDE = 8192  # descriptions that ask for larger images are refused
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from hudepth.base.errors import ConfigError
 
+KEY = "hudepth"  # under which exported files carry the description of their model, as JSON
 PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}  # and OpenVINO's names for them; bfloat16 is not exact
 
 
@@ -27,6 +28,17 @@ def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, An
     options["PERFORMANCE_HINT"] = "LATENCY"
     model = core.read_model(path)
     return model, core.compile_model(model, "CPU", options).create_infer_request()
+
+
+def onnx_description(session: Any) -> str:
+    """Return the model's description that hudepth stored in an ONNX file; empty if there is none."""
+    return str(session.get_modelmeta().custom_metadata_map.get(KEY, ""))
+
+
+def openvino_description(model: Any) -> str:
+    """Return the model's description that hudepth stored in an IR or an ONNX file; empty if there is none."""
+    places = ([KEY], ["framework", KEY])  # in an IR, in a model read from ONNX
+    return next((str(model.get_rt_info(place).astype(str)) for place in places if model.has_rt_info(place)), "")
 
 
 def package(name: str, *, extra: str) -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hudepth.base.errors import CheckpointError
-from hudepth.inference.runtimes import onnx_session, openvino_model
+from hudepth.inference.runtimes import onnx_description, onnx_session, openvino_description, openvino_model
 
 TIMEOUT_S = 25
 MAX_BYTES = 3 << 30
@@ -31,8 +31,8 @@ LOOPS = {"Loop", "If", "Scan", "TensorIterator", "While"}
 def try_graph(path: Path, *, backend: str, threads: int) -> dict[str, Any]:
     """Run a graph once, on zeros.
 
-    Returns ``inputs`` and ``outputs``: data type and shape of each. Raises CheckpointError if it is damaged, does not
-    end in time, takes too much memory, or holds loops.
+    Returns ``inputs`` and ``outputs``, data type and shape of each, and ``description``. Raises CheckpointError if the
+    graph is damaged, does not end in time, takes too much memory, or holds loops.
     """
     command = [sys.executable, "-m", __name__, str(path.resolve()), backend, str(threads)]
     home = Path(__file__).parents[2]  # Python looks for modules where it starts: not where the file may lie
@@ -73,7 +73,7 @@ def _zeros(kind: str, shape: list[Any]) -> Any:
     return np.zeros(sides, kind)
 
 
-def _try_onnx(path: Path, threads: int) -> tuple[Any, Any]:
+def _try_onnx(path: Path, threads: int) -> tuple[str, Any, Any]:
     if importlib.util.find_spec("onnx"):
         import onnx
 
@@ -83,10 +83,11 @@ def _try_onnx(path: Path, threads: int) -> tuple[Any, Any]:
     session = onnx_session(path, threads=threads)
     taken = session.get_inputs()
     inputs = [(each.type[7:-1].replace("float", "float32"), each.shape) for each in taken]  # tensor(float)
-    return inputs, session.run(None, {each.name: _zeros(*kind) for each, kind in zip(taken, inputs, strict=True)})
+    outputs = session.run(None, {each.name: _zeros(*kind) for each, kind in zip(taken, inputs, strict=True)})
+    return onnx_description(session), inputs, outputs
 
 
-def _try_openvino(path: Path, threads: int) -> tuple[Any, Any]:
+def _try_openvino(path: Path, threads: int) -> tuple[str, Any, Any]:
     model, request = openvino_model(path, threads=threads, precision="float32")
     _refuse_loops(each.get_type_name() for each in model.get_ops())
     inputs = []
@@ -94,15 +95,16 @@ def _try_openvino(path: Path, threads: int) -> tuple[Any, Any]:
         sides = [side.get_length() if side.is_static else -1 for side in each.partial_shape]
         inputs.append((each.element_type.to_dtype().name, sides))
     results = request.infer({number: _zeros(*kind) for number, kind in enumerate(inputs)})
-    return inputs, [np.asarray(results[number]) for number in range(len(model.outputs))]
+    outputs = [np.asarray(results[number]) for number in range(len(model.outputs))]
+    return openvino_description(model), inputs, outputs
 
 
 def _main(path: str, backend: str, threads: str) -> None:
     _limit_memory()
     try:
-        inputs, outputs = (_try_openvino if backend == "openvino" else _try_onnx)(Path(path), int(threads))
+        text, inputs, outputs = (_try_openvino if backend == "openvino" else _try_onnx)(Path(path), int(threads))
         returned = [(str(getattr(each, "dtype", "?")), list(getattr(each, "shape", []))) for each in outputs]
-        found: dict[str, Any] = {"inputs": inputs, "outputs": returned}
+        found: dict[str, Any] = {"description": text, "inputs": inputs, "outputs": returned}
     except BaseException as error:  # the libraries have dozens of ways to fail
         found = {"error": (str(error).strip().splitlines() or [type(error).__name__])[0][:200]}
     print(f"\n{json.dumps(found)}", flush=True)

@@ -204,7 +204,6 @@ def test_nothing_is_wider_than_the_screen(tab: Any, width: int, height: int) -> 
     assert tab.locator(".hd-stage").bounding_box()["width"] > 0.6 * min(width, height)
 
 
-@pytest.mark.xfail(reason="failed once since results and uploads are bounded together; to be looked into")
 def test_what_a_session_had_goes_with_it(tab: Any, page: Page) -> None:
     send(tab, "c.png", PICTURE)
     caption(tab, "c.png")

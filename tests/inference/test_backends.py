@@ -75,7 +75,7 @@ def test_a_crafted_graph_that_is_sound(backend: str, tmp_path: Path) -> None:
         "size",
         "two",
         "int64",
-        pytest.param("string", marks=pytest.mark.xfail(reason="failed once under OpenVINO")),
+        "string",
         "scalar",
         "loop",
     ],
