@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -110,6 +111,17 @@ def test_first_stages_stay_as_they_are_until_their_share_is_over(
             if name.endswith("running_mean"):
                 assert not after[name].equal(before[name])  # statistics go on being gathered
     assert all(p.requires_grad == (name not in kept or frozen < epochs) for name, p in net.named_parameters())
+
+
+@pytest.mark.parametrize(("epoch", "learns"), [(1, False), (2, True)])
+def test_a_resumed_run_freezes_as_its_epoch_does(epoch: int, learns: bool) -> None:
+    """Lightning skips ``on_train_epoch_start`` in the first epoch after a resume."""
+    trainer: Any = SimpleNamespace(world_size=1, max_epochs=4, current_epoch=epoch)
+    module: Any = SimpleNamespace(net=Net())
+    freeze = FreezeEncoder(until=0.5, stages=["stem"])
+    freeze.setup(trainer, module, "fit")
+    freeze.on_train_start(trainer, module)
+    assert module.net.encoder.conv1.weight.requires_grad == learns
 
 
 def test_frozen_statistics_and_frozen_stages_leave_nothing_to_change(cache: Path) -> None:
