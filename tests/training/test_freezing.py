@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -116,12 +115,14 @@ def test_first_stages_stay_as_they_are_until_their_share_is_over(
 @pytest.mark.parametrize(("epoch", "learns"), [(1, False), (2, True)])
 def test_a_resumed_run_freezes_as_its_epoch_does(epoch: int, learns: bool) -> None:
     """Lightning skips ``on_train_epoch_start`` in the first epoch after a resume."""
-    trainer: Any = SimpleNamespace(world_size=1, max_epochs=4, current_epoch=epoch)
-    module: Any = SimpleNamespace(net=Net())
+    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, max_epochs=4)
+    trainer.fit_loop.epoch_progress.current.completed = epoch
+    net = Net()
+    module = DepthModule(net, L1(), max_depth_m=10.0, optimizer=torch.optim.AdamW)
     freeze = FreezeEncoder(until=0.5, stages=["stem"])
     freeze.setup(trainer, module, "fit")
     freeze.on_train_start(trainer, module)
-    assert module.net.encoder.conv1.weight.requires_grad == learns
+    assert net.encoder.conv1.weight.requires_grad == learns
 
 
 def test_frozen_statistics_and_frozen_stages_leave_nothing_to_change(cache: Path) -> None:
@@ -142,7 +143,8 @@ def test_a_share_of_an_endless_training(cache: Path) -> None:
 
 
 def test_several_processes_share_only_what_they_knew_from_the_start() -> None:
-    module = DepthModule(Net(), L1(), max_depth_m=10.0, optimizer=partial(torch.optim.AdamW, lr=1e-3))
+    net = Net()
+    module = DepthModule(net, L1(), max_depth_m=10.0, optimizer=partial(torch.optim.AdamW, lr=1e-3))
     trainer = Trainer(accelerator="cpu", devices=2, logger=False, enable_checkpointing=False, strategy="ddp")
     with pytest.raises(ConfigError, match=r"^FreezeEncoder\.until: .* processes"):
         FreezeEncoder(until=0.5).setup(trainer, module, "fit")
