@@ -159,6 +159,7 @@ def test_what_is_no_name_is_no_choice_of_a_group(group: str, value: str, command
     assert re.match(rf"hudepth-test: {group.lstrip('+')}: no '", done.err.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "key"),
     [

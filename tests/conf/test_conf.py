@@ -117,6 +117,7 @@ def test_the_recipe_without_pretraining_is_the_recipe_where_there_is_none() -> N
     assert "no_pretraining" not in labels
 
 
+@pytest.mark.slow
 def test_the_subsets_of_badcls_terms_are_all_seven() -> None:
     weights = [job.config["loss"] for job in jobs_of("loss_terms", "seed=1") if job.config]
     subsets = {

@@ -494,6 +494,7 @@ def test_a_kill_leaves_nothing_that_passes_for_a_store(tmp_path: Path, root: Pat
     assert not list(cache.glob(".*.part"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit_bytes", [20_000, 60_000])
 def test_a_file_that_cannot_grow_gives_one_line_and_no_crash(
     tmp_path: Path, root: Path, cache: Path, limit_bytes: int

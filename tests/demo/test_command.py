@@ -11,6 +11,7 @@ import pytest
 from tests.commands import Command
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("argument", "words"),
     [

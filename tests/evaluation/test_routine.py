@@ -145,6 +145,7 @@ def test_two_protocols_of_one_name(net: TinyUNet) -> None:
     assert str(caught.value).startswith("protocol: two have the same name among paper, native, paper.")
 
 
+@pytest.mark.slow
 def test_a_flip_averages_the_mirrored_prediction(cache: Path, net: TinyUNet) -> None:
     data = make_data(cache)
     flip = dataclasses.replace(PAPER, name="flip", flip=True)

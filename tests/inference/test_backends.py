@@ -27,6 +27,7 @@ def test_an_onnx_file_of_another_model(tmp_path: Path) -> None:
             hudepth.load(tmp_path / "other.onnx", backend=backend)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"text", b"\x08\x09" * 50], ids=["empty", "text", "binary"])
 @pytest.mark.parametrize("name", ["x.onnx", "x.xml", "x.pt2", "x.zip", "x.safetensors"])
 def test_damaged_files(name: str, content: bytes, tmp_path: Path) -> None:
@@ -68,6 +69,7 @@ def test_a_crafted_graph_that_is_sound(backend: str, tmp_path: Path) -> None:
     assert model.predict(np.full((20, 30, 3), 7, np.uint8)).metres == pytest.approx(7)
 
 
+@pytest.mark.slow
 @BACKENDS
 @pytest.mark.parametrize(
     "kind",

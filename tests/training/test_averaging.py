@@ -198,6 +198,7 @@ def test_best_holds_the_average_alone_and_last_the_weights_beside_it(cache: Path
     assert last["averaging_state"]["n_averaged"].item() == 9
 
 
+@pytest.mark.slow
 def test_the_metrics_of_an_epoch_are_those_of_the_average(cache: Path, tmp_path: Path) -> None:
     fit(cache, tmp_path, [EMA(decay=0.7)])
     last = read_plain(tmp_path / "checkpoints" / "last.ckpt")

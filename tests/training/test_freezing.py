@@ -84,6 +84,7 @@ def stage_of(name: str) -> str:
     return {"conv1": "stem", "bn1": "stem"}.get(part, part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("until", "stages", "epochs", "frozen"),
     [

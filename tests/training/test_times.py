@@ -111,6 +111,7 @@ def test_a_resumed_run_adds_to_the_rows_of_the_epochs_that_are_done(cache: Path,
     assert 90 <= float(rows[2]["cpu_s"]) <= float(rows[3]["cpu_s"]) < 140
 
 
+@pytest.mark.slow
 def test_a_new_run_in_the_same_place_begins_anew(cache: Path, tmp_path: Path) -> None:
     (tmp_path / "times.csv").write_text(HEADER + "1,32,48,8,100.00,50.00,0.01\n")
     fit(cache, tmp_path, epochs=1)

@@ -66,6 +66,7 @@ def test_a_list_of_names_will_do(command: Command, tmp_path: Path) -> None:
     assert not (tmp_path / "audit_densedepth" / "leaks.png").exists()
 
 
+@pytest.mark.slow
 def test_copies_are_found_and_shown(command: Command, tmp_path: Path) -> None:
     write_list(tmp_path / "nyu")
     write_frames(tmp_path / "nyu", copies=True)
