@@ -190,5 +190,5 @@ def _report(job: Job, *, seconds: float) -> None:
     }  # fmt: skip
     try:
         write_json(job.output / "predictions.json", record)
-    except OSError:
-        log.warning("'%s' could not be written", job.output / "predictions.json")
+    except OSError as error:
+        log.warning("'%s' could not be written (%s)", job.output / "predictions.json", error.strerror or error)

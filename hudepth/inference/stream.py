@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -24,7 +24,7 @@ LOT = 8  # images per thread that are decoded, predicted and written together: f
 class Tally:
     """The results of a stream."""
 
-    done: int = 0
+    done: int = 0  # inputs that were predicted and written
     failed: dict[str, str] = field(default_factory=dict)  # inputs that could not be read or written, and why
     notes: dict[str, str] = field(default_factory=dict)  # remarks on images that were predicted
 
@@ -61,11 +61,12 @@ class Stream(Generic[Key]):
                         if job is not None:
                             jobs.append(job)
                         yield key
-                    _wait(writing)  # for the previous lot
+                    self._count(writing)  # of the previous lot
                     writing = [pool.submit(job) for job in jobs]
                     if not self.overlap:
-                        _wait(writing)
-                _wait(writing)
+                        self._count(writing)
+                        writing = []
+                self._count(writing)
             finally:
                 for future in writing:
                     future.cancel()
@@ -107,7 +108,6 @@ class Stream(Generic[Key]):
             batch = good[at : at + self.batch_size]
             depths = self.model.run([prepared for _, prepared in batch])
             for (key, prepared), depth in zip(batch, depths, strict=True):
-                self.tally.done += 1
                 if prepared.photo.notes:
                     self.tally.notes[str(key)] = "; ".join(prepared.photo.notes)
                 yield key, partial(self._finish, key, prepared, self._smooth(depth))
@@ -121,7 +121,9 @@ class Stream(Generic[Key]):
     def _finish(self, key: Key, prepared: Prepared, depth: Float[np.ndarray, "h w"]) -> None:
         self.write(key, self.model.finish(prepared, depth))
 
-
-def _wait(futures: list[Future[None]]) -> None:
-    for future in futures:
-        future.result()
+    def _count(self, writing: list[Future[None]]) -> None:
+        """Wait for what is being written, and count it; raise the first error."""
+        wait(writing)
+        self.tally.done += sum(future.exception() is None for future in writing)
+        for future in writing:
+            future.result()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -71,7 +74,11 @@ def _utf8(path: Path) -> str:
 
 
 class VideoWriter:
-    """An ``.mp4`` that appears when the block ends, with all frames written so far, even after an error."""
+    """An ``.mp4`` that appears when the block ends, with all frames written so far.
+
+    It does so even after an error, but then it does not replace an earlier one. OpenCV says nothing of a full disk:
+    OSError is raised here instead, and the video does not appear.
+    """
 
     def __init__(self, path: Path, *, rate: float) -> None:
         self.path, self._rate = path, rate
@@ -85,8 +92,10 @@ class VideoWriter:
     def write(self, rgb: UInt8[np.ndarray, "h w 3"]) -> None:
         """Add a frame; all must have the size of the first. Odd sides lose a pixel, since the codec needs even ones.
 
-        Raises DataError if the video cannot be written.
+        Raises DataError if the video cannot be written, and OSError if the disk is full.
         """
+        if not shutil.disk_usage(self.path.parent).free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
         even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
         if self._writer is None:
             size = (even.shape[1], even.shape[0])
@@ -95,8 +104,28 @@ class VideoWriter:
                 raise DataError(f"'{self.path}': cannot write a video of {size[0]} x {size[1]} there.")
         self._writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
 
-    def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.release()
-        if self._part.exists():
-            self._part.replace(self.path)  # keeps the frames so far
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._writer is None:
+            return
+        self._writer.release()
+        try:
+            if not _is_whole(self._part):
+                raise OSError(errno.ENOSPC, "the disk is full, or a file may not be so large", str(self.path))
+            if kind is None or not self.path.exists():
+                self._part.replace(self.path)
+        finally:
+            self._part.unlink(missing_ok=True)
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether an MP4 file has its index, which is written last, and ends where its last box does."""
+    if not path.exists():
+        return False
+    end, at, kinds = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while 0 <= at < end:
+            file.seek(at)
+            length, kind, long = struct.unpack(">I4sQ", file.read(16).ljust(16, b"\0"))
+            kinds.add(kind)
+            at += max(8, long if length == 1 else length)
+    return at == end and b"moov" in kinds

@@ -87,9 +87,12 @@ def test_a_slow_disk_holds_back_the_reading(grey: DepthModel, overlap: bool) -> 
 
 
 def test_a_full_disk_ends_it(grey: DepthModel) -> None:
-    def write(_: int, __: DepthMap) -> None:
-        raise OSError(28, "No space left on device")
+    def write(number: int, _: DepthMap) -> None:
+        if number >= 3:
+            raise OSError(28, "No space left on device")
 
-    stream: Stream[int] = Stream(grey, write, tally=Tally())
+    tally = Tally()
+    stream: Stream[int] = Stream(grey, write, tally=tally)
     with pytest.raises(OSError, match="No space left"):
         list(stream.run((number, frame(number)) for number in range(100)))
+    assert tally.done == 3  # what was written, not what was predicted

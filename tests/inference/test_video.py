@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -69,6 +72,49 @@ def test_a_video_is_written_with_even_sides_and_kept_when_something_fails(tmp_pa
     assert [frame.shape for frame in frames] == [(32, 46, 3)] * 3
     assert reader.rate == 5
     assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
+
+
+def write_three(path: Path) -> None:
+    with VideoWriter(path, rate=5) as writer:
+        for _ in range(3):
+            writer.write(np.zeros((32, 48, 3), np.uint8))
+
+
+def test_a_full_disk_is_noticed_before_the_next_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 9, 0))
+    with pytest.raises(OSError, match="No space left"):
+        write_three(tmp_path / "out.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of file sizes")
+def test_a_video_that_was_cut_off_leaves_the_earlier_one(tmp_path: Path) -> None:
+    """OpenCV does not say that it could not write."""
+    path = tmp_path / "out.mp4"
+    write_three(path)
+    earlier = path.read_bytes()
+    code = "import resource, sys, pathlib; from tests.inference.test_video import write_three; "
+    code += "resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512)); write_three(pathlib.Path(sys.argv[1]))"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], check=False, capture_output=True, text=True)
+    assert "OSError" in done.stderr
+    assert path.read_bytes() == earlier
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_video_that_ends_in_an_error_does_not_replace_one(tmp_path: Path) -> None:
+    path = tmp_path / "out.mp4"
+    write_three(path)
+    earlier = path.read_bytes()
+
+    def interrupted() -> None:
+        with VideoWriter(path, rate=5) as writer:
+            writer.write(np.zeros((32, 48, 3), np.uint8))
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        interrupted()
+    assert path.read_bytes() == earlier
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_no_frame_no_file(tmp_path: Path) -> None:
