@@ -29,6 +29,7 @@ from PIL import (
 
 from hudepth.base.errors import DataError
 
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it cannot read becomes an error of one line
 _PLUGINS = (
     JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin, TiffImagePlugin, GifImagePlugin,
     PpmImagePlugin, *([AvifImagePlugin] if features.check("avif") else []),
@@ -87,7 +88,8 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
             check_pixels(image.height, image.width, where=where, most=max_pixels)
             notes = _notes(image)
             image.load()
-            rgb = _to_rgb(image, where)
+            turn = _TURNS.get(_orientation(image))
+            rgb = pillow_rgb(image if turn is None else image.transpose(turn), where=where)
     except DataError:
         raise
     except UnidentifiedImageError:
@@ -109,20 +111,18 @@ def _notes(image: Image.Image) -> tuple[str, ...]:
     return (f"animated, {frames} frames: the first is taken",) if animated else ()
 
 
-def _to_rgb(image: Image.Image, where: str) -> UInt8[np.ndarray, "h w 3"]:
-    turn = _TURNS.get(_orientation(image))
-    upright = image if turn is None else image.transpose(turn)
-    if upright.mode == "RGB":
-        return np.asarray(upright, np.uint8)
-    if upright.mode.startswith("I"):  # 16 bits of grey, which Pillow may hold in 32
-        return as_rgb(np.asarray(upright).clip(0, 65535).astype(np.uint16), where=where)
-    if upright.mode == "F":
+def pillow_rgb(image: Image.Image, *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+    """Return a Pillow image of any mode as 8-bit RGB, not turned; DataError if its pixels are floating-point."""
+    if image.mode == "RGB":
+        return np.asarray(image, np.uint8)
+    if image.mode.startswith("I"):  # 16 bits of grey, which Pillow may hold in 32
+        return as_rgb(np.asarray(image).clip(0, 65535).astype(np.uint16), where=where)
+    if image.mode == "F":
         raise DataError(f"{where}: floating-point pixels have no known range. Save the image with 8 or 16 bits.")
-    if upright.has_transparency_data:
-        rgba = upright.convert("RGBA")
-        white = Image.new("RGBA", rgba.size, (255, 255, 255, 255))
-        upright = Image.alpha_composite(white, rgba)
-    return np.asarray(upright.convert("RGB"), np.uint8)
+    if image.has_transparency_data:
+        rgba = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", rgba.size, (255, 255, 255, 255)), rgba)
+    return np.asarray(image.convert("RGB"), np.uint8)
 
 
 def _check_tags(data: bytes, where: str) -> None:

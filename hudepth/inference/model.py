@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.images import Photo, as_rgb, read_photo
+from hudepth.base.images import Photo, as_rgb, pillow_rgb, read_photo
 from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Choice, Range, Size, parse
 from hudepth.inference.backends import EXPORTED, Backend, BackendName, TorchBackend, open_exported
@@ -61,15 +61,16 @@ class DepthModel:
 
     def prepare(self, image: Picture) -> Prepared:
         """Decode an image and resize it to the network's input; raises DataError if it cannot be read."""
-        if isinstance(image, Image.Image):
-            image = np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
         if isinstance(image, torch.Tensor):
-            image = image.detach().cpu().numpy()
-            if image.ndim == 3 and image.shape[0] in (1, 3, 4) and image.shape[2] not in (1, 3, 4):
-                image = np.moveaxis(image, 0, 2)
-        if not isinstance(image, str | Path | bytes | np.ndarray):
+            image = _pixels(image)
+        if isinstance(image, Image.Image):
+            photo = Photo(pillow_rgb(image), ())
+        elif isinstance(image, np.ndarray):
+            photo = Photo(as_rgb(image), ())
+        elif isinstance(image, str | Path | bytes):
+            photo = read_photo(image)
+        else:
             raise TypeError(f"image: {type(image).__name__}. Pass a path, bytes, array, tensor or Pillow image.")
-        photo = Photo(as_rgb(image), ()) if isinstance(image, np.ndarray) else read_photo(image)
         return Prepared(photo, fit_image(photo.rgb, self.info.size, fit=self.fit, aspect=self.info.aspect))
 
     def run(self, batch: Sequence[Prepared]) -> Float[np.ndarray, "b h w"]:
@@ -87,6 +88,18 @@ class DepthModel:
         rgb = prepared.photo.rgb
         metres = unfit_depth(depth_m, prepared.fitted.box, (rgb.shape[0], rgb.shape[1]))
         return DepthMap(metres, rgb, self.info.max_depth_m, prepared.photo.notes)
+
+
+def _pixels(image: torch.Tensor) -> NDArray[Any]:
+    """Return a tensor as an array with the channels last; TypeError if it does not hold the numbers of a picture."""
+    if image.dtype not in (torch.uint8, torch.uint16) or image.layout != torch.strided or image.is_meta:
+        raise TypeError(
+            f"image: a tensor of {str(image.dtype).removeprefix('torch.')}. Pass uint8 or uint16 of shape "
+            "[height,width,3] or [3,height,width]; floats from 0 to 1 are (255 * x).round().to(torch.uint8)."
+        )
+    array: NDArray[Any] = image.cpu().numpy()
+    first = array.ndim == 3 and array.shape[0] in (1, 3, 4) and array.shape[2] not in (1, 3, 4)
+    return np.moveaxis(array, 0, 2) if first else array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +150,8 @@ def load(
     """
     values = {
         "checkpoint": str(spec), "backend": backend, "device": device, "precision": precision, "threads": threads,
-        "size": size, "fit": fit, "flip": flip, "trust": list(trust), "runs": runs,
+        "size": size, "fit": fit, "flip": flip, "runs": runs,
+        "trust": trust if isinstance(trust, str) else list(trust),
     }  # fmt: skip
     return load_model(parse(ModelOptions, values))
 

@@ -29,7 +29,6 @@ class FrameReader:
 
     def __init__(self, source: Path | int) -> None:
         self.name = f"camera {source}" if isinstance(source, int) else f"'{source}'"
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # its warnings become errors below
         self._capture = cv2.VideoCapture(source if isinstance(source, int) else _utf8(source))
         if not self._capture.isOpened():
             self._capture.release()

@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import hudepth
-from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.errors import CheckpointError, ConfigError, DataError
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
 
@@ -63,3 +64,29 @@ def test_tensors_are_pictures_and_lists_are_cameras(grey: DepthModel) -> None:
         depth.point_cloud([60.0, 61.0])
     with pytest.raises(ConfigError, match=r"intrinsics: .*64 x 48"):
         depth.point_cloud([4.2, 4.2, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.bool])
+def test_a_tensor_that_holds_no_bytes_is_refused_with_what_is_taken(grey: DepthModel, dtype: torch.dtype) -> None:
+    with pytest.raises(TypeError, match=r"image: a tensor of \w+\. Pass uint8 or uint16"):
+        grey.predict(torch.ones(3, 48, 64).to(dtype))
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 48, 64), (5, 48, 64), (48,)])
+def test_a_tensor_of_another_shape_is_refused_with_what_is_taken(grey: DepthModel, shape: tuple[int, ...]) -> None:
+    with pytest.raises(DataError, match=r"shape .*Pass RGB as uint8"):
+        grey.predict(torch.zeros(shape, dtype=torch.uint8))
+
+
+def test_a_float_array_is_not_read_as_bytes(grey: DepthModel) -> None:
+    with pytest.raises(DataError, match="float64"):
+        grey.predict(np.full((48, 64, 3), 0.5))
+
+
+def test_pillow_images_of_any_mode_are_read_as_their_files_are(grey: DepthModel) -> None:
+    sixteen = Image.fromarray(np.full((48, 64), 30_000, np.uint16))
+    assert grey.predict(sixteen).image[0, 0].tolist() == [117, 117, 117]  # 30000 / 257
+    clear = Image.new("LA", (64, 48), (10, 0))
+    assert grey.predict(clear).image[0, 0].tolist() == [255, 255, 255]
+    with pytest.raises(DataError, match="floating-point"):
+        grey.predict(Image.fromarray(np.full((48, 64), 0.5, np.float32)))
