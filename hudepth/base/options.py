@@ -55,6 +55,8 @@ class Broadcast:
 
 Size = Annotated[tuple[int, int], Range(1), Broadcast(), "[height,width]"]
 """(height, width) in pixels; one number makes a square."""
+TrainSize = Annotated[tuple[int, int], Range(1, 2048), Broadcast(), "[height,width] of at most 2048 pixels each"]
+"""That of training images: what a checkpoint of others asks for must not fill the memory."""
 
 
 def parse(schema: type[T], values: Mapping[str, Any], *, prefix: str = "", strict: bool = False) -> T:

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from hudepth.base.console import log
 from hudepth.base.errors import DataError
-from hudepth.base.options import Range, Size, convert
+from hudepth.base.options import Range, TrainSize, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
 from hudepth.data.dataset import BlockShuffle, LateLoader, ShardSampler, StoreDataset, as_is
@@ -84,7 +84,7 @@ class DepthDataModule(LightningDataModule):
         check_split(split, fractions)
         self.source, self.augment, self.teacher_folder = source, augment, teacher
         self.split_kind, self.fractions = split, tuple(fractions)
-        self.size: tuple[int, int] = convert("data.size", size, Size)
+        self.size: tuple[int, int] = convert("data.size", size, TrainSize)
         self.stages = read_stages(progressive or [], size=self.size)
         self.split_seed: int = convert("data.split_seed", split_seed, int)
         self.seed: int = convert("data.seed", seed, int)

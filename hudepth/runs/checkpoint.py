@@ -187,4 +187,12 @@ def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
 
 
 def _is_state(value: object) -> bool:
-    return isinstance(value, dict) and all(isinstance(n, str) and isinstance(v, Tensor) for n, v in value.items())
+    return isinstance(value, dict) and all(isinstance(n, str) and _is_plain(v) for n, v in value.items())
+
+
+def _is_plain(value: object) -> bool:
+    """Tell whether a value is a tensor with real numbers in memory: neither sparse, quantised, nor without any."""
+    if not isinstance(value, Tensor):
+        return False
+    dense = value.layout == torch.strided and value.device.type == "cpu"
+    return dense and not (value.is_quantized or value.is_complex())

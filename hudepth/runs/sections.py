@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hudepth.base.errors import CheckpointError, ConfigError
-from hudepth.base.options import Range, Size, parse
+from hudepth.base.options import Range, TrainSize, parse
 
 Part = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class _Data:
-    size: Size | None = None
+    size: TrainSize | None = None
     max_depth_m: Annotated[float, Range(0, above=True)] | None = None
     source: Part = field(default_factory=dict)
 

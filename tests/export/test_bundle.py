@@ -86,3 +86,11 @@ def test_an_untrusted_configuration_runs_no_code(bundle: Path, tmp_path: Path) -
     with pytest.raises(ConfigError, match="is not under a trusted module"):
         hudepth.load(altered(bundle, tmp_path, {"config.json": json.dumps(content).encode()}))
     assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("size", [65536, [8192, 8192], [0, 48], "wide", None, [32, 48, 3]])
+def test_an_untrusted_configuration_asks_for_no_absurd_size(size: object, bundle: Path, tmp_path: Path) -> None:
+    content = json.loads((bundle / "config.json").read_text())
+    content["config"]["data"]["size"] = size
+    with pytest.raises(CheckpointError, match=r"altered\.zip.*(data\.size|does not record)"):
+        hudepth.load(altered(bundle, tmp_path, {"config.json": json.dumps(content).encode()}))

@@ -129,3 +129,20 @@ def test_compare_draws_no_images_of_other_data(command: Command, trained: Path, 
     assert done.code == 0, done.err
     assert "no images.png: " in done.err
     assert {path.name for path in (tmp_path / "compare").iterdir()} == {"compare.json", "compare.csv", "compare.png"}
+
+
+def test_a_table_leaves_out_a_damaged_run_by_name(command: Command, trained: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(trained, damaged)
+    file = damaged / "test" / "paper" / "metrics.json"
+    document = json.loads(file.read_text())
+    document["metrics"]["model"]["rmse"] = 1e308
+    file.write_text(json.dumps(document))
+    done = command("report", "table", f"runs=[{trained},{damaged}]", "protocol=paper")
+    assert done.code == 0, done.err
+    assert f"left out: '{file}' is not a test result: its rmse is beyond" in done.err
+    with (tmp_path / "table" / "table.csv").open(newline="") as table:
+        assert [row["name"] for row in csv.DictReader(table)] == ["tiny"]
+    done = command("report", "table", f"runs=[{damaged}]", "protocol=paper")
+    assert done.code == 1
+    assert str(file) in done.err.splitlines()[-1]

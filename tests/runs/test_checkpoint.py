@@ -358,6 +358,19 @@ def test_incomplete(run: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     assert refused(path).startswith(f"'{path}' is incomplete: ")
 
 
+@pytest.mark.parametrize(
+    "change",
+    [Tensor.to_sparse, lambda tensor: tensor.to("meta"), lambda tensor: tensor.to(torch.complex64),
+     lambda tensor: torch.quantize_per_tensor(tensor, 0.1, 0, torch.quint8)],
+    ids=["sparse", "meta", "complex", "quantised"],
+)  # fmt: skip
+def test_tensors_of_another_kind_are_refused(tmp_path: Path, change: Callable[[Tensor], Tensor]) -> None:
+    net = TinyUNet(channels=4)
+    state = {f"net.{name}": change(value) if value.ndim > 1 else value for name, value in net.state_dict().items()}
+    path = written(tmp_path, MODEL, net, state_dict=state)
+    assert refused(path).startswith(f"'{path}' is incomplete: ")
+
+
 # --- finding one ------------------------------------------------------------------------------------------------
 
 

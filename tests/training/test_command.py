@@ -361,3 +361,15 @@ def test_a_cosine_schedule_has_its_end(command: Command, tmp_path: Path) -> None
         "resume: the learning-rate schedule of this run is laid out over 2 epochs, so trainer.max_epochs cannot"
         in done.err.splitlines()[-1]
     )
+
+
+def test_a_last_checkpoint_of_another_training_is_named(command: Command, trained: Path) -> None:
+    last = trained / "checkpoints" / "last.ckpt"
+    content = read_plain(last)
+    for state in content["optimizer_states"][0]["state"].values():
+        state["exp_avg"] = torch.zeros(7)
+    torch.save(content, last)
+    done = command("train", f"resume={trained}", "trainer.max_epochs=3")
+    assert done.code == 1
+    assert f"'{last}' does not fit this training" in done.err.splitlines()[-1]
+    assert status(trained)["state"] == "failed"
