@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
+
+WITHOUT_FLOAT64 = {"mps"}
 
 
 def full_precision(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return ``x`` as float32, or as it is if float64: half precision cannot hold a sum over an image."""
     return x if x.dtype == torch.float64 else x.float()
+
+
+def widest_float(device: torch.device) -> torch.dtype:
+    """Return float64, in which sums over images are kept, or float32 on MPS, which has no float64."""
+    return torch.float32 if device.type in WITHOUT_FLOAT64 else torch.float64
+
+
+def widen(x: Shaped[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Return ``x`` in the :func:`widest_float` of its device."""
+    return x.to(widest_float(x.device))
 
 
 def masked_sum(

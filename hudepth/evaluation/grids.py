@@ -10,9 +10,10 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hudepth.base.masked import widen, widest_float
 from hudepth.metrics.alignment import align
 from hudepth.metrics.depth import SUM_NAMES, DepthMaps, depth_maps
 from hudepth.metrics.protocol import Protocol
@@ -71,12 +72,14 @@ class Scored:
         """Return the prediction as the protocol scores it: aligned, then clamped."""
         return self._cache.get(("prediction", *self._variant(protocol)), lambda: self._prediction(protocol))
 
-    def sums(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
+    def sums(self, protocol: Protocol) -> Float[Tensor, "b k"]:
         """Return a row of :data:`SUM_COLUMNS` per image; where the crop leaves nothing, it counts 0 pixels."""
         height, width = self.grid.depth_m.shape[-2:]
         window = protocol.window(height, width)
         if window is None:
-            row = torch.zeros(len(self.pred_m), len(SUM_COLUMNS), dtype=torch.float64, device=self.pred_m.device)
+            row = torch.zeros(
+                len(self.pred_m), len(SUM_COLUMNS), dtype=widest_float(self.pred_m.device), device=self.pred_m.device
+            )
             row[:, -1] = torch.nan
             return row
         rows, columns = window
@@ -109,11 +112,11 @@ class Scored:
         pred_m, key = self.prediction(protocol), ("maps", *self._variant(protocol))
         return self._cache.get(key, lambda: depth_maps(pred_m, self.grid.depth_m, self.grid.measured))
 
-    def _ssim(self, protocol: Protocol, rows: slice, columns: slice) -> Float64[Tensor, " b"]:
+    def _ssim(self, protocol: Protocol, rows: slice, columns: slice) -> Float[Tensor, " b"]:
         size, measured = protocol.ssim_window, self.grid.measured
         height, width = measured[..., rows, columns].shape[-2:]
         if min(height, width) < size:
-            return torch.full((len(measured),), torch.nan, dtype=torch.float64, device=measured.device)
+            return torch.full((len(measured),), torch.nan, dtype=widest_float(measured.device), device=measured.device)
         # the windows inside the crop are windows of the whole image
         top, left = rows.start, columns.start
         inside = slice(top, top + height - size + 1), slice(left, left + width - size + 1)
@@ -125,5 +128,5 @@ class Scored:
 
         key = ("ssim", size, protocol.ssim_data_range_m, *self._variant(protocol))
         values = self._cache.get(key, compute)[..., *inside]
-        total = torch.where(whole, values, 0.0).sum(dim=(1, 2, 3)).double()
+        total = widen(torch.where(whole, values, 0.0).sum(dim=(1, 2, 3)))
         return total / whole.sum(dim=(1, 2, 3))

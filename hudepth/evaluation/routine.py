@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
@@ -42,10 +42,10 @@ class Evaluation(LightningModule):
         # known when the test has ended:
         self.indices: list[int] = []
         """Store positions of the scored images, in the order of the rows."""
-        self.sums: dict[tuple[str, str], Float64[Tensor, "n k"]] = {}
+        self.sums: dict[tuple[str, str], Float[Tensor, "n k"]] = {}
         """By predictor and protocol; the others by protocol, of the detailed predictor."""
-        self.boundary: dict[str, Float64[Tensor, "n k"]] = {}
-        self.strata: dict[str, Float64[Tensor, "n bins k"]] = {}
+        self.boundary: dict[str, Float[Tensor, "n k"]] = {}
+        self.strata: dict[str, Float[Tensor, "n bins k"]] = {}
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score a batch."""

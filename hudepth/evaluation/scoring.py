@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.masked import widen
 from hudepth.base.types import Batch
 from hudepth.data.sources.base import Record
 from hudepth.evaluation.grids import SUM_COLUMNS, Cache, Grid, Scored
@@ -54,21 +55,21 @@ class BatchScores:
         self._pred_m, self._truth = pred_m, truth
         self._cache = Cache()
 
-    def sums(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
+    def sums(self, protocol: Protocol) -> Float[Tensor, "b k"]:
         """Return a row of sums for each image: columns as in :data:`SUM_COLUMNS`, then registered metrics."""
         columns = [torch.cat([scored.sums(protocol) for scored in self._scored(protocol)])]
         functions = registered_functions().values()
         images = [*self._cropped(protocol)] if functions else []
         for function in functions:
-            values = [torch.where(x[2].any(dim=(1, 2, 3)), function(*x).double(), torch.nan) for x in images]
+            values = [torch.where(x[2].any(dim=(1, 2, 3)), widen(function(*x)), torch.nan) for x in images]
             columns.append(torch.cat(values)[:, None])
         return torch.cat(columns, dim=1)
 
-    def boundary(self, protocol: Protocol) -> Float64[Tensor, "b k"]:
+    def boundary(self, protocol: Protocol) -> Float[Tensor, "b k"]:
         """Return the boundary metrics of each image, columns as in :data:`hudepth.metrics.boundary.BOUNDARY_NAMES`."""
         return torch.cat([torch.stack([*boundary_metrics(*x).values()], dim=1) for x in self._cropped(protocol)])
 
-    def strata(self, protocol: Protocol) -> Float64[Tensor, "b bins k"]:
+    def strata(self, protocol: Protocol) -> Float[Tensor, "b bins k"]:
         """Return the sums of each image over the bins of :data:`hudepth.metrics.strata.STRATA`."""
         return torch.cat([strata_sums(*x) for x in self._cropped(protocol)])
 
@@ -102,10 +103,10 @@ _MODES = {"nearest": "nearest-exact", "bilinear": "bilinear", "bicubic": "bicubi
 
 def image_table(
     protocol: Protocol,
-    sums: Float64[Tensor, "n k"],
+    sums: Float[Tensor, "n k"],
     records: Sequence[Record],
     *,
-    boundary: Float64[Tensor, "n e"] | None = None,
+    boundary: Float[Tensor, "n e"] | None = None,
 ) -> ImageTable:
     """Turn rows of :meth:`BatchScores.sums` and :meth:`BatchScores.boundary` into the metrics of each image."""
     columns = dict(zip((*SUM_COLUMNS, *registered_functions()), sums.T, strict=True))

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.masked import widen
 from hudepth.base.types import DepthMap, Mask
 
 ALIGNMENTS = ("none", "median", "least_squares", "affine_inverse")
@@ -40,7 +41,7 @@ def align(pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, kind: str) -> De
         )
     if kind == "none":
         return pred_m
-    images = zip(pred_m.double(), target_m.double(), valid, strict=True)
+    images = zip(widen(pred_m), widen(target_m), valid, strict=True)
     aligned = [_ONE[kind](pred, pred[mask], target[mask]) if mask.any() else pred for pred, target, mask in images]
     return torch.stack(aligned).to(pred_m.dtype)
 

@@ -14,10 +14,10 @@ itself: coarsely quantised ground truth has steps where the scene has none.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
-from hudepth.base.masked import full_precision
+from hudepth.base.masked import full_precision, widen, widest_float
 from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.canny import canny_edges, chamfer_px
 from hudepth.metrics.depth import MIN_DEPTH_M
@@ -32,7 +32,7 @@ BOUNDARY_NAMES = (
 """Keys of :func:`boundary_metrics`."""
 
 
-def boundary_metrics(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float64[Tensor, " b"]]:
+def boundary_metrics(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float[Tensor, " b"]]:
     """All measures of this file with their published settings, by the names and in the order of :data:`BOUNDARY_NAMES`.
 
     ``pred_m`` [m] is finite where valid, ``target_m`` [m] positive. NaN where the ground truth has no such edge.
@@ -49,7 +49,7 @@ def boundary_metrics(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[
 
 def edge_scores(
     pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, threshold: float
-) -> dict[str, Float64[Tensor, " b"]]:
+) -> dict[str, Float[Tensor, " b"]]:
     """Precision, recall and F1 = 2 hits / (predicted + true) of predicted edge pixels, in [0, 1] (Hu et al. 2019).
 
     An edge pixel is one where sqrt(fx^2 + fy^2) > threshold [m], fx and fy the plain 3 x 3 Sobel sums of depth in
@@ -68,7 +68,7 @@ def si_boundary_f1(
     min_ratio: float = 1.05,
     max_ratio: float = 1.25,
     steps: int = 10,
-) -> Float64[Tensor, " b"]:
+) -> Float[Tensor, " b"]:
     """Scale-invariant boundary F1 (Bochkovskii et al. 2024, section 3.2).
 
     A pixel occludes its left, right, upper or lower neighbour at threshold t if that is more than t times as deep. At
@@ -81,10 +81,10 @@ def si_boundary_f1(
     score below 1. Here a direction counts for recall if the ground truth has occlusions, for precision if either has,
     and a threshold counts if the ground truth has. With all directions at all thresholds both agree.
     """
-    ratios = torch.linspace(min_ratio, max_ratio, steps, dtype=torch.float64, device=pred_m.device)
+    ratios = torch.linspace(min_ratio, max_ratio, steps, dtype=widest_float(pred_m.device), device=pred_m.device)
     pred, target = (torch.where(valid, full_precision(x).clamp_min(MIN_DEPTH_M), 1.0) for x in (pred_m, target_m))
     counts = [_occlusions(pred, target, valid, ratios, dim=dim) for dim in (-1, -2)]
-    hits, predicted, true = torch.cat(counts, dim=2).double()  # each [b, 4 directions, steps]
+    hits, predicted, true = widen(torch.cat(counts, dim=2))  # each [b, 4 directions, steps]
     recall = _mean_where(true > 0, hits / true, dim=1)
     precision = _mean_where(true + predicted > 0, hits / predicted.clamp_min(1), dim=1)
     f1 = (2 * precision * recall / (precision + recall)).nan_to_num()
@@ -101,7 +101,7 @@ def depth_boundary_errors(
     low: float = 0.15,
     high: float = 0.3,
     reach_px: float = 10.0,
-) -> dict[str, Float64[Tensor, " b"]]:
+) -> dict[str, Float[Tensor, " b"]]:
     """Depth boundary errors (Koch et al. 2018), from exact Euclidean distances between edge pixels.
 
     acc_px: mean distance from a predicted edge pixel to the nearest true one, over those nearer than ``reach_px``;
@@ -124,7 +124,7 @@ def depth_boundary_errors(
     for pred, target, mask in zip(*maps, valid.squeeze(1).cpu().numpy(), strict=True):
         edges = (canny_edges(x, mask, sigma_px=sigma_px, low=low, high=high) for x in (pred, target))
         rows.append(chamfer_px(*edges, reach_px=reach_px))
-    values = torch.tensor(rows, dtype=torch.float64, device=pred_m.device).reshape(-1, 2)
+    values = torch.tensor(rows, dtype=widest_float(pred_m.device), device=pred_m.device).reshape(-1, 2)
     return {"acc_px": values[:, 0], "comp_px": values[:, 1]}
 
 
@@ -148,13 +148,13 @@ def _squared_sobel(x: DepthMap) -> Float[Tensor, "b 1 rows columns"]:
 def _edge_scores(pred: Tensor, target: Tensor, threshold: float) -> dict[str, Tensor]:
     """Scores from squared slopes."""
     predicted, true = pred > threshold**2, target > threshold**2
-    hits, claims, edges = (mask.sum(dim=(1, 2, 3)).double() for mask in (predicted & true, predicted, true))
+    hits, claims, edges = (widen(mask.sum(dim=(1, 2, 3))) for mask in (predicted & true, predicted, true))
     scores = {"precision": hits / claims.clamp_min(1), "recall": hits / edges, "f1": 2 * hits / (claims + edges)}
     return {name: torch.where(edges > 0, score, torch.nan) for name, score in scores.items()}
 
 
 def _occlusions(
-    pred: DepthMap, target: DepthMap, valid: Mask, ratios: Float64[Tensor, " steps"], *, dim: int
+    pred: DepthMap, target: DepthMap, valid: Mask, ratios: Float[Tensor, " steps"], *, dim: int
 ) -> Int64[Tensor, "3 b 2 steps"]:
     """Count hits, predicted and true occlusions between neighbours along ``dim``, both ways, at each ratio."""
     size = valid.shape[dim] - 1

@@ -6,16 +6,19 @@ Metrics that follow from the same sums share their states in a :class:`torchmetr
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Float64
-from torch import Tensor
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
 from torchmetrics import Metric, MetricCollection
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.masked import widen
 from hudepth.base.options import Range, convert
 from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.catalogue import Function, metric_info, registered_functions
@@ -26,7 +29,21 @@ Averaging = Literal["image", "pooled"]
 """``image``: the mean of the images' metrics (usual); ``pooled``: over all pixels at once."""
 
 
-class DepthMetrics(Metric):
+class SumMetric(Metric):
+    """A metric whose states are float64 sums; on MPS, which has no float64, they are float32."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = ()) -> nn.Module:
+        @functools.wraps(fn)  # torchmetrics goes by its name
+        def apply(x: Tensor) -> Tensor:
+            try:
+                return fn(x)
+            except TypeError:
+                return fn(x.float())
+
+        return super()._apply(apply, exclude_state)
+
+
+class DepthMetrics(SumMetric):
     """All metrics of :mod:`hudepth.metrics.depth`, as a dictionary.
 
     Args:
@@ -146,7 +163,7 @@ class Delta(DepthMetric):
         self.name = f"delta{convert('power', power, Annotated[int, Range(1, 3)], default=1)}"
 
 
-class ImageMetric(Metric, ABC):
+class ImageMetric(SumMetric, ABC):
     """The mean over images of a metric that may be undefined for some of them, which are skipped."""
 
     full_state_update = False
@@ -190,7 +207,7 @@ class DepthSSIM(ImageMetric):
             raise ConfigError(f"metrics.data_range: {data_range} is not positive. Pass the maximum depth in metres.")
         self.data_range = data_range
 
-    def measure(self, pred_m: Tensor, target_m: Tensor, valid: Tensor) -> tuple[Float64[Tensor, " b"], Tensor]:
+    def measure(self, pred_m: Tensor, target_m: Tensor, valid: Tensor) -> tuple[Float[Tensor, " b"], Tensor]:
         """Return SSIM, and which images have a window of valid pixels."""
         total, windows = ssim_sums(pred_m, target_m, valid, data_range=self.data_range)
         return total / windows, windows > 0
@@ -205,7 +222,7 @@ class FunctionMetric(ImageMetric):
 
     def measure(self, pred_m: Tensor, target_m: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Return the function's values, and where they are defined."""
-        values = self.function(pred_m, target_m, valid).double()
+        values = widen(self.function(pred_m, target_m, valid))
         return values, valid.flatten(1).any(dim=1) & ~values.isnan()
 
 

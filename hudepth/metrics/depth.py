@@ -24,10 +24,10 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
-from hudepth.base.masked import full_precision
+from hudepth.base.masked import full_precision, widen
 from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.catalogue import depth_names
 
@@ -52,23 +52,23 @@ class DepthMaps(NamedTuple):
 
     maps: Float[Tensor, "k b 1 h w"]
     """The terms named in :data:`SUM_NAMES` after the count. Where not valid, errors are 0 and deltas 1."""
-    shift: Float64[Tensor, " b"]
+    shift: Float[Tensor, " b"]
     """Mean log ratio of each image, taken out of ``log`` and ``log_squared``: silog subtracts nearly equal sums."""
 
     def sums(
         self, valid: Mask, *, masked: bool, rows: slice = slice(None), columns: slice = slice(None)
-    ) -> dict[str, Float64[Tensor, " b"]]:
+    ) -> dict[str, Float[Tensor, " b"]]:
         """Sum over the valid pixels of a crop; ``masked``: these are the very pixels that the maps were made with."""
         maps, valid = self.maps[..., rows, columns], valid[..., rows, columns]
         count = valid.flatten(1).sum(dim=1)
         if masked:
-            totals = maps.sum(dim=(-3, -2, -1)).double()
+            totals = widen(maps.sum(dim=(-3, -2, -1)))
             totals[-len(DELTAS) :] -= valid[0].numel() - count  # invalid pixels were counted
         else:
-            totals = (maps * valid).sum(dim=(-3, -2, -1)).double()
+            totals = widen((maps * valid).sum(dim=(-3, -2, -1)))
             if not bool(totals.isfinite().all()):  # 0 times NaN is NaN
-                totals = torch.where(valid, maps, 0.0).sum(dim=(-3, -2, -1)).double()
-        sums = dict(zip(SUM_NAMES, (count.double(), *totals), strict=True))
+                totals = widen(torch.where(valid, maps, 0.0).sum(dim=(-3, -2, -1)))
+        sums = dict(zip(SUM_NAMES, (widen(count), *totals), strict=True))
         centred, count64 = sums["log"], sums["count"]
         sums["log"] = centred + count64 * self.shift
         sums["log_squared"] = sums["log_squared"] + self.shift * (2 * centred + count64 * self.shift)
@@ -94,24 +94,24 @@ def depth_maps(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> DepthMaps:
     torch.log(ratio, out=log)
     torch.abs(log, out=log10).div_(math.log(10))
     count = valid.flatten(1).sum(dim=1).clamp_min(1)
-    shift = (log.flatten(1).sum(dim=1).double() / count).to(log.dtype)
+    shift = (widen(log.flatten(1).sum(dim=1)) / count).to(log.dtype)
     shift = torch.where(shift.isfinite(), shift, 0.0)  # else one bad pixel would reach the sums of all others
     log.sub_(torch.where(valid, shift.reshape(-1, 1, 1, 1), 0.0))
     torch.mul(log, log, out=log_squared)
     worse = torch.maximum(ratio, target / positive)
     for delta, threshold in zip(deltas, DELTAS, strict=True):
         torch.lt(worse, threshold, out=delta)
-    return DepthMaps(maps, shift.double())
+    return DepthMaps(maps, widen(shift))
 
 
-def depth_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float64[Tensor, " b"]]:
+def depth_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> dict[str, Float[Tensor, " b"]]:
     """Sum :func:`depth_maps` over each image's valid pixels, in float64, by the names of :data:`SUM_NAMES`."""
     return depth_maps(pred_m, target_m, valid).sums(valid, masked=True)
 
 
 def depth_metrics_from_sums(
-    sums: dict[str, Float64[Tensor, "*b"]], *, silog_lambda: float = 1.0, silog_factor: float = 100.0
-) -> dict[str, Float64[Tensor, "*b"]]:
+    sums: dict[str, Float[Tensor, "*b"]], *, silog_lambda: float = 1.0, silog_factor: float = 100.0
+) -> dict[str, Float[Tensor, "*b"]]:
     """Turn sums over pixels into the metrics named in :data:`METRIC_NAMES`; NaN where the count is 0.
 
     Sums of one image give its metrics, sums added up those of all pixels. ``silog_lambda`` is the share of the squared
@@ -136,7 +136,7 @@ def depth_metrics_from_sums(
 
 def depth_metrics(
     pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, silog_lambda: float = 1.0, silog_factor: float = 100.0
-) -> dict[str, Float64[Tensor, " b"]]:
+) -> dict[str, Float[Tensor, " b"]]:
     """Metrics of each image: :func:`depth_metrics_from_sums` of :func:`depth_sums`."""
     sums = depth_sums(pred_m, target_m, valid)
     return depth_metrics_from_sums(sums, silog_lambda=silog_lambda, silog_factor=silog_factor)

@@ -16,11 +16,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.masked import full_precision, masked_sum
+from hudepth.base.masked import full_precision, masked_sum, widen
 from hudepth.base.types import DepthMap, Mask
 
 
@@ -85,12 +85,12 @@ def ssim_sums(
     sigma: float = 1.5,
     k1: float = 0.01,
     k2: float = 0.03,
-) -> tuple[Float64[Tensor, " b"], Int64[Tensor, " b"]]:
+) -> tuple[Float[Tensor, " b"], Int64[Tensor, " b"]]:
     """Sum of :func:`ssim_map` over each image's windows whose pixels are all valid, and how many there are."""
     pred, target = torch.where(valid, pred, 0.0), torch.where(valid, target, 0.0)
     values = ssim_map(pred, target, data_range=data_range, window=window, sigma=sigma, k1=k1, k2=k2)
     whole = whole_windows(valid, window)
-    return masked_sum(values, whole, dim=(1, 2, 3)).flatten().double(), whole.sum(dim=(1, 2, 3))
+    return widen(masked_sum(values, whole, dim=(1, 2, 3)).flatten()), whole.sum(dim=(1, 2, 3))
 
 
 def whole_windows(valid: Mask, window: int) -> Bool[Tensor, "b 1 rows columns"]:

@@ -15,11 +15,11 @@ from dataclasses import astuple, dataclass, fields
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float64, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hudepth.base.masked import full_precision
+from hudepth.base.masked import full_precision, widen
 from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.depth import DELTAS, MIN_DEPTH_M
 
@@ -67,7 +67,7 @@ class Stratum:
     delta1: float
 
 
-def strata_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float64[Tensor, "b bins 5"]:
+def strata_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float[Tensor, "b bins 5"]:
     """Sum errors of depths [m] over each bin of :data:`STRATA`, image by image; columns as in :data:`STRATUM_SUMS`."""
     pred, target = (torch.where(valid, full_precision(x), 1.0) for x in (pred_m, target_m))
     error = (pred - target).abs()
@@ -81,12 +81,12 @@ def strata_sums(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float64[Te
     return _binned(torch.from_numpy(index).to(error.device), terms)
 
 
-def _binned(index: Int[Tensor, "b n"], terms: Sequence[Shaped[Tensor, "b 1 h w"]]) -> Float64[Tensor, "b bins k"]:
+def _binned(index: Int[Tensor, "b n"], terms: Sequence[Shaped[Tensor, "b 1 h w"]]) -> Float[Tensor, "b bins k"]:
     """Sum over cells, then over the cells of each bin: one pass over the pixels serves all groups."""
     size, places = len(index) * (_CELLS + 1), index.flatten().long()
-    weights = [torch.ones_like(places).double(), *(term.double().flatten() for term in terms)]
+    weights = [widen(torch.ones_like(places)), *(widen(term).flatten() for term in terms)]
     # not bincount, whose weights have no deterministic form on GPUs
-    empty = torch.zeros(size, dtype=torch.float64, device=index.device)
+    empty = torch.zeros(size, dtype=weights[0].dtype, device=index.device)
     sums = torch.stack([empty.index_add(0, places, weight) for weight in weights], dim=-1)
     cells = sums.reshape(len(index), _CELLS + 1, -1)[:, :_CELLS].reshape(len(index), *_SIZES, -1)
     return torch.cat([cells.sum(dim=others) for others in ((2, 3), (1, 3), (1, 2))], dim=1)
@@ -121,7 +121,7 @@ def edge_distance_px(depth_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> 
     return np.asarray(cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
-def summarise_strata(sums: Float64[Tensor, "n bins 5"], categories: Sequence[str]) -> list[Stratum]:
+def summarise_strata(sums: Float[Tensor, "n bins 5"], categories: Sequence[str]) -> list[Stratum]:
     """Turn the sums of a subset's images into metrics of each bin, pooled over its pixels; empty bins are left out.
 
     ``categories``: kind of scene of each image, empty where unknown. If any is known, the group ``category`` comes
@@ -148,7 +148,7 @@ def summarise_strata(sums: Float64[Tensor, "n bins 5"], categories: Sequence[str
     return strata
 
 
-def _by_category(pixels: Float64[Tensor, " n"], categories: Sequence[str]) -> list[tuple[str, list[int]]]:
+def _by_category(pixels: Float[Tensor, " n"], categories: Sequence[str]) -> list[tuple[str, list[int]]]:
     members: dict[str, list[int]] = {}
     for image, category in enumerate(categories):
         members.setdefault(category or "unknown", []).append(image)

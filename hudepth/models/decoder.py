@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hudepth.base.masked import widen
 from hudepth.base.options import convert
 
 UpsampleMode = Literal["nearest", "bilinear"]
@@ -133,12 +134,12 @@ class Head(nn.Module):
         result: Tensor = self.conv(self.up(x))
         return result
 
-    def joint(self, *, double: bool = False) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
-        """Return kernel and bias of :func:`joint_head`, in float64 if ``double``."""
+    def joint(self, *, wide: bool = False) -> tuple[Float[Tensor, "4 c_in 3 3"], Float[Tensor, " 4"]]:
+        """Return kernel and bias of :func:`joint_head`, in float64 if ``wide`` (float32 on MPS)."""
         assert self.up.bias is not None
         assert self.conv.bias is not None
         parts = (self.up.weight, self.up.bias, self.conv.weight, self.conv.bias)
-        return joint_head(*(part.double() if double else part for part in parts))
+        return joint_head(*(widen(part) if wide else part for part in parts))
 
     def run_joint(self, x: Float[Tensor, "b c h w"], joint: tuple[Tensor, Tensor]) -> Float[Tensor, "b 1 2*h 2*w"]:
         """Run the convolution of :func:`joint_head`, and the two steps along the border, on strips of two pixels."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hudepth.base.console import log
+from hudepth.base.masked import widen
 from hudepth.models.decoder import Head, UpBlock, split_kernel
 
 TOLERANCE = 1e-5
@@ -69,7 +70,7 @@ class MergedUpBlock(nn.Module):
 
     def __init__(self, block: UpBlock) -> None:
         super().__init__()
-        coarse, skip = split_kernel(block.conv1.weight.detach().double(), channels_in=block.channels_in)
+        coarse, skip = split_kernel(widen(block.conv1.weight.detach()), channels_in=block.channels_in)
         channels = block.conv1.out_channels
         self.coarse = nn.ConvTranspose2d(coarse.shape[0], channels, 4, stride=2, padding=1)
         self.skip = nn.Conv2d(skip.shape[1], channels, 3, padding=1, bias=False)
@@ -101,7 +102,7 @@ class MergedHead(nn.Module):
         self.joint = nn.Conv2d(head.up.in_channels, 4, 3, padding=1)
         assert self.joint.bias is not None
         with torch.no_grad():
-            weight, bias = head.joint(double=True)
+            weight, bias = head.joint(wide=True)
             self.joint.weight.copy_(weight)
             self.joint.bias.copy_(bias)
         self.requires_grad_(requires_grad=False)

@@ -22,6 +22,7 @@ from hudepth.metrics import catalogue
 from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.summary import ImageTable, summarise
+from tests.devices import without_float64
 
 F64 = NDArray[np.float64]
 EIGEN: dict[str, Any] = {
@@ -348,3 +349,19 @@ def test_a_registered_metric_becomes_a_column(monkeypatch: pytest.MonkeyPatch) -
     assert values[0] == pytest.approx(0.5)
     assert np.isnan(values[1])
     assert "bias" in catalogue.metric_names("narrow")
+
+
+@pytest.mark.parametrize("alignment", ["none", "median", "least_squares"])
+def test_a_device_without_float64(alignment: str) -> None:
+    pred_m, batch = make_batch()
+    protocol = Protocol(**EIGEN, alignment=alignment)
+
+    def everything() -> list[Tensor]:
+        scores = BatchScores(pred_m, BatchTruth(batch, max_depth_m=10.0))
+        return [scores.sums(protocol), scores.boundary(protocol), scores.strata(protocol)]
+
+    expected = everything()
+    with without_float64():
+        results = everything()
+    for result, right in zip(results, expected, strict=True):
+        torch.testing.assert_close(result.double(), right, rtol=1e-4, atol=1e-4, equal_nan=True)

@@ -20,6 +20,7 @@ from hudepth.metrics import MAE, MSE, RMSE, AbsRel, Delta, Log10, RMSELog, SILog
 from hudepth.metrics.collection import DepthMetrics, DepthSSIM, FunctionMetric
 from hudepth.metrics.depth import METRIC_NAMES, depth_metrics, depth_metrics_from_sums, depth_sums
 from hudepth.metrics.ssim import ssim
+from tests.devices import without_float64
 
 BUILD: dict[str, Callable[[], Metric]] = {
     "image": DepthMetrics,
@@ -214,3 +215,20 @@ def test_registered_functions_are_validated_where_they_are_defined() -> None:
 def test_images_smaller_than_the_window_say_so() -> None:
     with pytest.raises(ConfigError, match=r"^ssim: a 8 x 8 image has no window of 11 x 11 pixels\."):
         DepthSSIM(data_range=10.0).update(*make_images(side=8))
+
+
+def move_to_mps(x: Tensor) -> Tensor:
+    if x.dtype == torch.float64:
+        raise TypeError("Cannot convert a MPS Tensor to float64 dtype as the MPS framework doesn't support float64.")
+    return x.clone()
+
+
+@pytest.mark.parametrize("name", BUILD)
+def test_a_device_without_float64(name: str) -> None:
+    images = make_images()
+    expected = measure(BUILD[name](), [images])
+    metric = BUILD[name]()._apply(move_to_mps)
+    with without_float64():
+        for _ in range(2):  # the second time from the states that a reset leaves
+            metric.reset()
+            assert measure(metric, [images]) == pytest.approx(expected, rel=1e-5)
