@@ -16,7 +16,7 @@ class RawBatch(TypedDict):
 
     image: UInt8[Tensor, "b h w 3"]
     """RGB."""
-    depth_mm: UInt16[Tensor, "b h w"]
+    stored_depth: UInt16[Tensor, "b h w"]
     """Depth as the store holds it, 0 where unmeasured: ``per_m`` to the metre, or millimetres."""
     per_m: NotRequired[int]
     index: Int[Tensor, " b"]

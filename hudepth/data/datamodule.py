@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -121,15 +122,25 @@ class DepthDataModule(LightningDataModule):
     def prepare_data(self) -> None:
         """Build the depth store and read the teacher's depths; warn if most depths are clipped."""
         _ = self.store, self.teacher
-        beyond = share_beyond(self.store, self.max_depth_m)
+        beyond, text = self._clipped()
         if beyond > 0.01:
-            level = logging.WARNING if beyond > 0.5 else logging.INFO
-            text = "%.0f %% of measured pixels are beyond data.max_depth_m=%g and count as that%s"
-            fix = f". Pass a larger data.max_depth_m: depths reach {self.store.info['depth_max_m']:g} m"
-            log.log(level, text, 100 * beyond, self.max_depth_m, fix if beyond > 0.5 else "")
+            log.log(logging.WARNING if beyond > 0.5 else logging.INFO, text)
+
+    def _clipped(self) -> tuple[float, str]:
+        """Return the share of measured pixels beyond the maximum depth, and a line about it."""
+        beyond = share_beyond(self.store, self.max_depth_m)
+        text = f"{beyond:.0%} of measured pixels are beyond data.max_depth_m={self.max_depth_m:g} and count as that."
+        fix = f" Pass a larger data.max_depth_m: depths reach {self.store.info.get('depth_max_m', math.nan):g} m."
+        return beyond, text + fix * (beyond > 0.5)
 
     def train_dataloader(self) -> DataLoader[RawBatch]:
-        """Shuffled training batches; the last, shorter one is kept. DataError if there are no training pairs."""
+        """Shuffled training batches; the last, shorter one is kept.
+
+        Raises DataError if there are no training pairs, or over 90 % of the ground truth is clipped to a constant.
+        """
+        beyond, text = self._clipped()
+        if beyond > 0.9:
+            raise DataError(text)
         if not (self.split.train and self.split.val):
             raise DataError(
                 f"data.split={self.split.kind}: all pairs are test, none train or validate. Pass another data.split."

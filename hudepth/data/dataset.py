@@ -36,8 +36,10 @@ class StoreDataset(Dataset[RawBatch]):
     def __getitems__(self, positions: Sequence[int]) -> RawBatch:
         """Return the batch at these positions of the subset."""
         rows = [self.indices[position] for position in positions]
-        image, depth_mm = self.store.read(rows)
-        batch = RawBatch(image=torch.from_numpy(image), depth_mm=torch.from_numpy(depth_mm), index=torch.tensor(rows))
+        image, stored_depth = self.store.read(rows)
+        batch = RawBatch(
+            image=torch.from_numpy(image), stored_depth=torch.from_numpy(stored_depth), index=torch.tensor(rows)
+        )
         batch["per_m"] = self.store.per_m
         if self.native:
             batch["native_depth"] = [torch.from_numpy(self.store.read_native(row))[None] for row in rows]

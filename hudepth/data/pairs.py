@@ -36,7 +36,7 @@ class PreparedPair:
     """One pair, ready for the store, which holds its depth times :func:`values_per_metre`."""
 
     image: NDArray[np.uint8]
-    depth_mm: NDArray[np.uint16]
+    stored_depth: NDArray[np.uint16]
     native_png: NDArray[np.uint8] | None
     native_size: tuple[int, int]
     range_m: tuple[float, float, float]
@@ -82,7 +82,7 @@ def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, nativ
         png = cv2.imencode(".png", to_stored(depth_m, per_m), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
     return PreparedPair(
         image=image,
-        depth_mm=to_stored(depth.astype(np.float32, copy=False), per_m),
+        stored_depth=to_stored(depth.astype(np.float32, copy=False), per_m),
         native_png=None if png is None else png.astype(np.uint8, copy=False),
         native_size=(depth_m.shape[0], depth_m.shape[1]),
         range_m=(float(measured.min()), float(np.median(measured)), float(measured.max())),

@@ -41,7 +41,7 @@ def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Pa
 
     Raises DataError if the source's root, its index or a file cannot be read.
     """
-    contents = hash_contents(source, cache=cache)
+    contents = hash_contents(source.name, source.files(), cache=cache)
     unit = [source.encoding, values_per_metre(source), source.depth_scale_m, source.invalid]
     key = [VERSION, source.name, source.fingerprint(), contents, size, unit, native]
     return cache / f"{source.name}-{size[0]}x{size[1]}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
@@ -124,9 +124,9 @@ def _build(
                             raise DataError(f"{outcome} Fix it, or pass data.on_error=skip to leave out such pairs.")
                         skipped.append(outcome)
                         continue
-                    writer.append(record, outcome.image, outcome.depth_mm, outcome.native_png)
-                    histogram += np.bincount(outcome.depth_mm.ravel(), minlength=len(histogram))
-                    pairs.append(replace(outcome, image=_NONE, depth_mm=_NONE.astype(np.uint16), native_png=None))
+                    writer.append(record, outcome.image, outcome.stored_depth, outcome.native_png)
+                    histogram += np.bincount(outcome.stored_depth.ravel(), minlength=len(histogram))
+                    pairs.append(replace(outcome, image=_NONE, stored_depth=_NONE.astype(np.uint16), native_png=None))
             if not pairs:
                 raise DataError(f"{source.name}: none of {len(records)} pairs could be read; the first: {skipped[0]}")
             info = _info(source, pairs, skipped, histogram)

@@ -27,7 +27,7 @@ def preprocess(
         augment: changes the image in [0, 1] and the unit depth, and resizes them to ``size``.
     """
     image = batch["image"].permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format) / 255
-    unit_depth = batch["depth_mm"].to(torch.float32)[:, None] / (batch.get("per_m", 1000) * max_depth_m)
+    unit_depth = batch["stored_depth"].to(torch.float32)[:, None] / (batch.get("per_m", 1000) * max_depth_m)
     had_truth = unit_depth > 0
     if "teacher_m" in batch:
         teacher = batch["teacher_m"][:, None] / max_depth_m

@@ -4,7 +4,7 @@
 data set                dtype, shape         meaning
 ======================  ===================  ==========================================================
 image                   uint8 [n, h, w, 3]   RGB at training size
-depth_mm                uint16 [n, h, w]     depth at training size, 0 where unmeasured; millimetres, or as below
+depth                   uint16 [n, h, w]     at training size, ``per_metre`` to the metre, 0 where unmeasured
 native/png              uint8 [bytes]        ground truth at native resolution: 16-bit PNGs, one after another
 native/end              int64 [n]            where each of them ends
 records/<field>         [n]                  id, scene, frame, split, category of each pair
@@ -37,7 +37,7 @@ from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess
 
 FORMAT = "hudepth-depth-store"
-VERSION = 1
+VERSION = 2
 MM_PER_M = 1000
 OUTDOOR_PER_M = 256
 """Stored values per metre of a set that is not indoors, as KITTI stores them: up to 255.996 m."""
@@ -84,7 +84,7 @@ class StoreWriter:
             try:
                 self._image, self._depth = (
                     self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
-                    for name, dtype, shape in (("image", "u1", (*size, 3)), ("depth_mm", "u2", size))
+                    for name, dtype, shape in (("image", "u1", (*size, 3)), ("depth", "u2", size))
                 )
                 if native:
                     self._png = self._file.create_dataset("native/png", (0,), "u1", maxshape=(None,), chunks=(1 << 20,))
@@ -100,7 +100,7 @@ class StoreWriter:
         self,
         record: Record,
         image: NDArray[np.uint8],
-        depth_mm: NDArray[np.uint16],
+        stored_depth: NDArray[np.uint16],
         native_png: NDArray[np.uint8] | None,
     ) -> None:
         """Add one pair at training size, with its native ground truth as an encoded 16-bit PNG.
@@ -115,7 +115,7 @@ class StoreWriter:
                 for dataset in (self._image, self._depth):
                     dataset.resize(max(64, 2 * row), axis=0)
             self._image[row] = image
-            self._depth[row] = depth_mm
+            self._depth[row] = stored_depth
             if native_png is not None:
                 start = self._ends[-1] if self._ends else 0
                 self._png.resize(start + len(native_png), axis=0)
@@ -198,7 +198,7 @@ class DepthStore:
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
         file = self._handle.get(self.path)
-        for source, target in ((file["image"], images), (file["depth_mm"], depths)):
+        for source, target in ((file["image"], images), (file["depth"], depths)):
             for row, index in enumerate(indices):
                 source.read_direct(target, np.s_[index], np.s_[row])
         return images, depths
@@ -209,7 +209,7 @@ class DepthStore:
             return
         file = self._handle.get(self.path)
         with self.path.open("rb") as raw:
-            for name in ("image", "depth_mm"):
+            for name in ("image", "depth"):
                 data = file[name]
                 start, row = data.id.get_offset(), data.dtype.itemsize * math.prod(data.shape[1:])
                 if start is not None:  # else not in one piece

@@ -18,6 +18,7 @@ from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
 from hudepth.data.prepare import MAX_SIZES, build_once
 from hudepth.data.sources.base import Record
+from hudepth.data.sources.contents import hash_contents
 from hudepth.data.sources.decoding import read_depth
 from hudepth.data.sources.files import PerProcess
 from hudepth.data.store import DepthStore
@@ -46,8 +47,7 @@ class TeacherDepths:
         files = _find(root, records)
         self._position = {index: position for position, index in enumerate(rows)}
         self.size = store.size
-        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-        key = [store.path.name, str(root.resolve()), stats, rows]
+        key = [store.path.name, hash_contents("teacher", files, cache=store.path.parent), rows]
         self.path = store.path.with_name(f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5")
         build_once(self.path, partial(_prepare, files, store))
         self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)

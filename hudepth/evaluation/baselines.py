@@ -70,8 +70,8 @@ class NearestFrame(Baseline):
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Return the depth of the nearest training image of each image."""
-        _, depth_mm = self._store.read(self.nearest(image))
-        unit = _unit_depth(depth_mm, self._store.per_m * self._max_depth_m).float()[:, None].to(image.device)
+        _, stored_depth = self._store.read(self.nearest(image))
+        unit = _unit_depth(stored_depth, self._store.per_m * self._max_depth_m).float()[:, None].to(image.device)
         return torch.where(unit > 0, unit, self.fill)
 
 
@@ -91,11 +91,11 @@ def trivial_baselines(store: DepthStore, train: Sequence[int], *, max_depth_m: f
     described = []
     starts = range(0, len(train), _CHUNK)
     for start in track(starts, total=len(starts), what="trivial baselines"):
-        images, depth_mm = store.read(train[start : start + _CHUNK])
+        images, stored_depth = store.read(train[start : start + _CHUNK])
         # pooling first gives the same result faster
         small = functional.adaptive_avg_pool2d(torch.from_numpy(images).permute(0, 3, 1, 2).float(), DESCRIPTOR_SIZE)
         described.append(normalise_image(small / 255).flatten(1))
-        unit = _unit_depth(depth_mm, store.per_m * max_depth_m)
+        unit = _unit_depth(stored_depth, store.per_m * max_depth_m)
         total += unit.sum(dim=0)
         count += (unit > 0).sum(dim=0)
     mean = total.sum() / count.sum()

@@ -67,7 +67,7 @@ def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *,
         raw = dataset[position]
         batch = preprocess(raw, max_depth_m=max_depth_m)
         pred_m = module(batch["image"].to(device)).float().cpu()[0, 0] * max_depth_m
-        truth_m = np.minimum(raw["depth_mm"][0].numpy() / np.float32(store.per_m), np.float32(max_depth_m))
+        truth_m = np.minimum(raw["stored_depth"][0].numpy() / np.float32(store.per_m), np.float32(max_depth_m))
         record = store.records[int(raw["index"][0])]
         panels.append(Panel(raw["image"][0].numpy(), truth_m, pred_m.numpy(), title=record.id))
     module.train(was_training)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def test_batches_hold_the_pairs_of_their_subset(make: Make) -> None:
     assert raw["index"].tolist() == data.split.val
     images, depths = data.store.read(data.split.val)
     np.testing.assert_array_equal(raw["image"].numpy(), images)
-    np.testing.assert_array_equal(raw["depth_mm"].numpy(), depths)
+    np.testing.assert_array_equal(raw["stored_depth"].numpy(), depths)
     batch = data.on_after_batch_transfer(raw, 0)
     b = len(data.split.val)
     assert {key: (value.dtype, tuple(value.shape)) for key, value in batch.items()} == {
@@ -100,31 +101,31 @@ def test_a_batch_against_numpy(make: Make) -> None:
     assert batch["index"].tolist() == rows
 
 
-@given(depth_mm=arrays(np.uint16, (1, 2, 3)), max_depth_m=st.floats(0.1, 100))
-def test_unit_depth_is_clipped_and_zero_where_unmeasured(depth_mm: np.ndarray, max_depth_m: float) -> None:
+@given(stored_depth=arrays(np.uint16, (1, 2, 3)), max_depth_m=st.floats(0.1, 100))
+def test_unit_depth_is_clipped_and_zero_where_unmeasured(stored_depth: np.ndarray, max_depth_m: float) -> None:
     raw = RawBatch(
         image=torch.zeros(1, 2, 3, 3, dtype=torch.uint8),
-        depth_mm=torch.from_numpy(depth_mm),
+        stored_depth=torch.from_numpy(stored_depth),
         index=torch.zeros(1).long(),
     )
     batch = preprocess(raw, max_depth_m=max_depth_m)
-    expected = np.minimum(depth_mm / (1000 * max_depth_m), 1)[:, None]
+    expected = np.minimum(stored_depth / (1000 * max_depth_m), 1)[:, None]
     np.testing.assert_allclose(batch["unit_depth"].numpy(), expected, rtol=3e-7)
-    np.testing.assert_array_equal(batch["valid"].numpy(), depth_mm[:, None] > 0)
-    np.testing.assert_array_equal(batch["unit_depth"].numpy() > 0, depth_mm[:, None] > 0)
+    np.testing.assert_array_equal(batch["valid"].numpy(), stored_depth[:, None] > 0)
+    np.testing.assert_array_equal(batch["unit_depth"].numpy() > 0, stored_depth[:, None] > 0)
     assert batch["unit_depth"].max() <= 1
 
 
 def test_preprocess_leaves_its_input_alone() -> None:
     raw = RawBatch(
         image=torch.full((1, 2, 2, 3), 7, dtype=torch.uint8),
-        depth_mm=torch.full((1, 2, 2), 60_000).to(torch.uint16),
+        stored_depth=torch.full((1, 2, 2), 60_000).to(torch.uint16),
         index=torch.zeros(1).long(),
     )
     preprocess(raw, max_depth_m=10)
-    assert set(raw) == {"image", "depth_mm", "index"}
+    assert set(raw) == {"image", "stored_depth", "index"}
     assert raw["image"].unique().tolist() == [7]
-    assert raw["depth_mm"].to(torch.int64).unique().tolist() == [60_000]
+    assert raw["stored_depth"].to(torch.int64).unique().tolist() == [60_000]
 
 
 def test_test_batches_bring_the_native_truth(make: Make) -> None:
@@ -215,7 +216,7 @@ def test_two_loader_processes_give_the_same_batches(make: Make) -> None:
         assert len(one) == len(two)
         for a, b in zip(one, two, strict=True):
             assert list(a) == list(b)
-            for key in ("image", "depth_mm", "index"):
+            for key in ("image", "stored_depth", "index"):
                 assert torch.equal(a[key], b[key])
             for x, y in zip(a.get("native_depth", []), b.get("native_depth", []), strict=True):
                 assert torch.equal(x, y)
@@ -298,7 +299,7 @@ def test_a_batch_is_emptied_only_if_it_had_truth_to_lose_whatever_its_teacher_sa
 ) -> None:
     raw = RawBatch(
         image=torch.zeros(1, 4, 4, 3, dtype=torch.uint8),
-        depth_mm=torch.full((1, 4, 4), truth).to(torch.uint16),
+        stored_depth=torch.full((1, 4, 4), truth).to(torch.uint16),
         index=torch.tensor([0]),
         teacher_m=torch.ones(1, 4, 4),
     )
@@ -310,7 +311,8 @@ def test_a_batch_is_emptied_only_if_it_had_truth_to_lose_whatever_its_teacher_sa
 
 
 @pytest.mark.parametrize(
-    ("max_depth_m", "level", "share"), [(100, None, ""), (55, "INFO", "50 %"), (20, "WARNING", "100 %")]
+    ("max_depth_m", "level", "share"),
+    [(100, None, ""), (55, "INFO", "50%"), (35, "WARNING", "90%"), (20, "WARNING", "100%")],
 )
 def test_outdoor_depth_and_what_is_clipped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, max_depth_m: float, level: str | None, share: str
@@ -333,6 +335,8 @@ def test_outdoor_depth_and_what_is_clipped(
     torch.testing.assert_close(batch["native_depth"][0][0], expected)
     unit = preprocess(batch, max_depth_m=max_depth_m)["unit_depth"][0, 0]
     torch.testing.assert_close(unit, (expected / max_depth_m).clamp(max=1))
+    with pytest.raises(DataError, match="depths reach 80 m") if share == "100%" else nullcontext():
+        data.train_dataloader()
 
 
 def test_a_set_that_is_all_test_does_not_train(tmp_path: Path) -> None:

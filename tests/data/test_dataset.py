@@ -38,10 +38,10 @@ def test_a_batch_holds_the_rows_asked_for(store: DepthStore) -> None:
     assert len(dataset) == 3
     batch = dataset.__getitems__([2, 0, 2])
     images, depths = store.read([3, 5, 3])
-    assert sorted(batch) == ["depth_mm", "image", "index", "per_m"]
-    assert (batch["image"].dtype, batch["depth_mm"].dtype) == (torch.uint8, torch.uint16)
+    assert sorted(batch) == ["image", "index", "per_m", "stored_depth"]
+    assert (batch["image"].dtype, batch["stored_depth"].dtype) == (torch.uint8, torch.uint16)
     np.testing.assert_array_equal(batch["image"].numpy(), images)
-    np.testing.assert_array_equal(batch["depth_mm"].numpy(), depths)
+    np.testing.assert_array_equal(batch["stored_depth"].numpy(), depths)
     assert batch["index"].tolist() == [3, 5, 3]
 
 

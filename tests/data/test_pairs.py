@@ -56,7 +56,7 @@ def nearest(n_out: int, n_in: int) -> tuple[np.ndarray, np.ndarray]:
 def test_depth_takes_the_nearest_pixel(height: int, width: int, h: int, w: int) -> None:
     pair = random_pair(height, width)
     (rows, row_is_clear), (columns, column_is_clear) = nearest(h, height), nearest(w, width)
-    found = prepare_one(pair, (h, w)).depth_mm
+    found = prepare_one(pair, (h, w)).stored_depth
     assert (found.dtype, found.shape) == (np.uint16, (h, w))
     mm = np.rint(pair.depth * 1000)
     assert set(found.ravel()) <= set(mm.ravel())  # no mean of two surfaces
@@ -83,7 +83,7 @@ def test_equal_size_changes_nothing() -> None:
     pair = random_pair(24, 32)
     prepared = prepare_one(pair, (24, 32))
     np.testing.assert_array_equal(prepared.image, pair.image)
-    np.testing.assert_array_equal(prepared.depth_mm, np.rint(pair.depth * 1000))
+    np.testing.assert_array_equal(prepared.stored_depth, np.rint(pair.depth * 1000))
 
 
 def test_native_truth_and_figures() -> None:
@@ -169,7 +169,7 @@ def test_several_workers_yield_the_same_in_order(tmp_path: Path) -> None:
             continue
         assert isinstance(b, PreparedPair)
         np.testing.assert_array_equal(a.image, b.image)
-        np.testing.assert_array_equal(a.depth_mm, b.depth_mm)
+        np.testing.assert_array_equal(a.stored_depth, b.stored_depth)
         np.testing.assert_array_equal(a.native_png, b.native_png)
         assert (a.native_size, a.range_m, a.valid_fraction) == (b.native_size, b.range_m, b.valid_fraction)
 

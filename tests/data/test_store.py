@@ -25,8 +25,8 @@ from hudepth.data.store import DepthStore, StoreWriter, to_mm, to_stored
 SIZE = (3, 5)
 
 
-def png(depth_mm: np.ndarray) -> np.ndarray:
-    return cv2.imencode(".png", depth_mm)[1].ravel()
+def png(stored_depth: np.ndarray) -> np.ndarray:
+    return cv2.imencode(".png", stored_depth)[1].ravel()
 
 
 def write_store(
@@ -242,16 +242,16 @@ def test_a_foreign_hdf5_file(tmp_path: Path) -> None:
         file["image"] = np.zeros((1, *SIZE, 3))
     with pytest.raises(DataError) as caught:
         DepthStore(path)
-    assert str(caught.value) == f"'{path}' is not a depth store of version 1. Delete it and prepare again."
+    assert str(caught.value) == f"'{path}' is not a depth store of version 2. Delete it and prepare again."
 
 
 def test_another_version(filled: tuple[Any, ...]) -> None:
     path = filled[0].path
     with h5py.File(path, "r+") as file:
-        file.attrs["version"] = 2
+        file.attrs["version"] = 1
     with pytest.raises(DataError) as caught:
         DepthStore(path)
-    assert str(caught.value) == f"'{path}' is not a depth store of version 1. Delete it and prepare again."
+    assert str(caught.value) == f"'{path}' is not a depth store of version 2. Delete it and prepare again."
 
 
 def test_an_unfinished_file(tmp_path: Path) -> None:
@@ -292,9 +292,9 @@ def test_a_store_with_a_part_missing(filled: tuple[Any, ...], damage: Any) -> No
 
 def test_layout_is_as_documented(filled: tuple[Any, ...]) -> None:
     with h5py.File(filled[0].path) as file:
-        assert {key: (file[key].dtype, file[key].shape) for key in ("image", "depth_mm", "native/end")} == {
+        assert {key: (file[key].dtype, file[key].shape) for key in ("image", "depth", "native/end")} == {
             "image": (np.uint8, (7, *SIZE, 3)),
-            "depth_mm": (np.uint16, (7, *SIZE)),
+            "depth": (np.uint16, (7, *SIZE)),
             "native/end": (np.int64, (7,)),
         }
         assert len(file["native/png"]) == file["native/end"][-1]

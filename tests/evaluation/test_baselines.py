@@ -26,28 +26,28 @@ def test_constant_depth_answers_every_image_alike() -> None:
 class FakeStore(DepthStore):
     """Truth that is made up, in the form in which a depth store gives it."""
 
-    def __init__(self, depth_mm: np.ndarray) -> None:
+    def __init__(self, stored_depth: np.ndarray) -> None:
         self.per_m = 1000
-        self.depth_mm, self.size = depth_mm, depth_mm.shape[1:]  # no file is opened
-        self.images = np.random.default_rng(0).integers(0, 256, (*depth_mm.shape, 3)).astype(np.uint8)
+        self.stored_depth, self.size = stored_depth, stored_depth.shape[1:]  # no file is opened
+        self.images = np.random.default_rng(0).integers(0, 256, (*stored_depth.shape, 3)).astype(np.uint8)
 
     def read(self, indices: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        return self.images[list(indices)], self.depth_mm[list(indices)]
+        return self.images[list(indices)], self.stored_depth[list(indices)]
 
 
 @pytest.mark.parametrize("pairs", [1, 63, 64, 65, 200])
 def test_trivial_baselines(pairs: int) -> None:
     rng = np.random.default_rng(pairs)
-    depth_mm = rng.integers(500, 15_000, (pairs + 7, 5, 4)).astype(np.uint16)
-    depth_mm[rng.random(depth_mm.shape) < 0.3] = 0
-    depth_mm[:, 2, 1] = 0  # measured in no training image
+    stored_depth = rng.integers(500, 15_000, (pairs + 7, 5, 4)).astype(np.uint16)
+    stored_depth[rng.random(stored_depth.shape) < 0.3] = 0
+    stored_depth[:, 2, 1] = 0  # measured in no training image
     train = rng.permutation(pairs + 7)[:pairs].tolist()
-    depth_mm[[i for i in range(pairs + 7) if i not in train]] = 1  # what must not be looked at
-    store = FakeStore(depth_mm)
+    stored_depth[[i for i in range(pairs + 7) if i not in train]] = 1  # what must not be looked at
+    store = FakeStore(stored_depth)
     made = trivial_baselines(store, train, max_depth_m=8.0)
     assert list(made) == ["nearest_frame", "mean_depth_map", "mean_depth"]
 
-    metres = np.where(depth_mm[train] == 0, np.nan, np.minimum(depth_mm[train] / 1000, 8.0))
+    metres = np.where(stored_depth[train] == 0, np.nan, np.minimum(stored_depth[train] / 1000, 8.0))
     mean = np.nanmean(metres)
     counted = (~np.isnan(metres)).sum(axis=0)
     mean_map = np.where(counted > 0, np.nansum(metres, axis=0) / np.maximum(counted, 1), mean)
@@ -58,7 +58,7 @@ def test_trivial_baselines(pairs: int) -> None:
 
     alike = made["nearest_frame"](images)  # a training image is most like itself
     for position, index in enumerate(train):
-        expected = np.where(depth_mm[index] == 0, mean_map, np.minimum(depth_mm[index] / 1000, 8.0))
+        expected = np.where(stored_depth[index] == 0, mean_map, np.minimum(stored_depth[index] / 1000, 8.0))
         np.testing.assert_allclose(8 * alike[index, 0].numpy(), expected, rtol=1e-6)
         assert made["nearest_frame"].nearest(images[index : index + 1]) == [train[position]]
 

@@ -89,12 +89,12 @@ def test_one_row_for_each_test_image(cache: Path, net: TinyUNet) -> None:
 def test_rows_against_numpy(cache: Path, net: TinyUNet) -> None:
     data = make_data(cache)
     evaluation = evaluate(data, {"model": net}, PAPER)
-    image, depth_mm = data.store.read(data.split.test)
+    image, stored_depth = data.store.read(data.split.test)
     mean, std = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
     with torch.inference_mode():
         normal = torch.from_numpy(((image / 255 - mean) / std).transpose(0, 3, 1, 2)).float()
         pred_m = 10 * net(normal)[:, 0].double().numpy()
-    truth_m = np.minimum(depth_mm / 1000, 10)
+    truth_m = np.minimum(stored_depth / 1000, 10)
     assert (truth_m == 0).any()
     rows = table(data, evaluation).values
     for row, (p, t) in enumerate(zip(pred_m, truth_m, strict=True)):

@@ -328,9 +328,9 @@ def test_panels_show_what_the_network_predicts(data: DepthDataModule, training: 
     indices = [3, 0]
     panels = make_panels(net, data.store, indices, max_depth_m=4.0)
     assert net.training is training
-    image, depth_mm = data.store.read(indices)
-    assert (depth_mm == 0).any()
-    assert (depth_mm > 4000).any()
+    image, stored_depth = data.store.read(indices)
+    assert (stored_depth == 0).any()
+    assert (stored_depth > 4000).any()
     mean, std = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
     normal = torch.from_numpy(((image / 255 - mean) / std).transpose(0, 3, 1, 2)).float()
     with torch.inference_mode():
@@ -338,7 +338,7 @@ def test_panels_show_what_the_network_predicts(data: DepthDataModule, training: 
     for row, panel in enumerate(panels):
         assert panel.title == data.store.records[indices[row]].id
         assert np.array_equal(panel.image, image[row])
-        np.testing.assert_allclose(panel.truth_m, np.minimum(depth_mm[row] / 1000, 4), rtol=1e-6)
+        np.testing.assert_allclose(panel.truth_m, np.minimum(stored_depth[row] / 1000, 4), rtol=1e-6)
         np.testing.assert_allclose(panel.pred_m, pred_m[row], rtol=1e-5, atol=1e-6)
 
 

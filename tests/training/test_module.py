@@ -85,13 +85,13 @@ def test_validation_metrics_are_those_of_the_whole_subset(cache: Path, batch_siz
     data, module = make_data(cache, batch_size=batch_size), make_module()
     trainer = make_trainer()
     trainer.validate(module, datamodule=data, verbose=False)
-    image, depth_mm = data.store.read(data.split.val)
+    image, stored_depth = data.store.read(data.split.val)
     mean, std = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
     normal = torch.from_numpy(((image / 255 - mean) / std).transpose(0, 3, 1, 2)).float()
     with torch.inference_mode():
         pred_m = module.net.eval()(normal).double().numpy()[:, 0] * 10
-    truth_m = np.minimum(depth_mm / 1000, 10)
-    assert (depth_mm == 0).any()
+    truth_m = np.minimum(stored_depth / 1000, 10)
+    assert (stored_depth == 0).any()
     each = [numpy_metrics(p, t, t > 0) for p, t in zip(pred_m, truth_m, strict=True)]
     for name in each[0]:
         expected = np.mean([one[name] for one in each])

@@ -14,24 +14,22 @@ from typing import Any
 
 from hudepth.base.errors import DataError
 from hudepth.base.files import write_text
-from hudepth.data.sources.base import Source
 
 _THREADS = 8
 _SETTLED_NS = 2 * 10**9
 """A file changed more recently is read again next time: a further change could leave its stat as it is."""
 
 
-def hash_contents(source: Source, *, cache: Path) -> str:
-    """Return a hash over the contents of all files of ``source``, in order; missing files count as such.
+def hash_contents(name: str, files: Sequence[Path], *, cache: Path) -> str:
+    """Return a hash over the contents of all ``files`` of the set ``name``, in order; missing files count as such.
 
     A file is read only if its size, times or inode differ from what a JSON file in ``cache`` remembers. Raises
     DataError if a file cannot be read.
     """
-    files = source.files()
     if not files:
         return ""
     folder = os.path.commonpath([file.absolute().parent for file in files])
-    memo = cache / f"contents-{source.name}-{hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]}.json"
+    memo = cache / f"contents-{name}-{hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]}.json"
     known = _read(memo)
     now = time.time_ns()
     with ThreadPoolExecutor(_THREADS) as pool:  # hashing and reading release the interpreter's lock

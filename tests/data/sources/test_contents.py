@@ -43,18 +43,18 @@ def test_only_what_changed_is_read_again(tmp_path: Path, monkeypatch: pytest.Mon
     digest = hashlib.file_digest
     monkeypatch.setattr(hashlib, "file_digest", lambda file, kind: (read.append(file.name), digest(file, kind))[1])
     monkeypatch.setattr("hudepth.data.sources.contents._SETTLED_NS", -(10**12))
-    first = hash_contents(source, cache=tmp_path)
+    first = hash_contents(source.name, source.files(), cache=tmp_path)
     assert len(read) == 6
-    assert hash_contents(source, cache=tmp_path) == first
+    assert hash_contents(source.name, source.files(), cache=tmp_path) == first
     assert len(read) == 6
     np.save(tmp_path / "set/depths/1.npy", np.full((6, 8), 3, np.float32))
     os.utime(tmp_path / "set/depths/1.npy", (0, 0))
-    assert hash_contents(source, cache=tmp_path) != first
+    assert hash_contents(source.name, source.files(), cache=tmp_path) != first
     assert len(read) == 7
     next(tmp_path.glob("contents-*.json")).write_text("[" * 100_000)
-    hash_contents(source, cache=tmp_path)
+    hash_contents(source.name, source.files(), cache=tmp_path)
     assert len(read) == 13
 
 
 def test_generated_sources_have_no_files(tmp_path: Path) -> None:
-    assert hash_contents(RoomsSource(scenes=2), cache=tmp_path) == ""
+    assert hash_contents("rooms", RoomsSource(scenes=2).files(), cache=tmp_path) == ""
