@@ -312,7 +312,7 @@ def test_a_batch_is_emptied_only_if_it_had_truth_to_lose_whatever_its_teacher_sa
 
 @pytest.mark.parametrize(
     ("max_depth_m", "level", "share"),
-    [(100, None, ""), (55, "INFO", "50%"), (35, "WARNING", "90%"), (20, "WARNING", "100%")],
+    [(100, None, ""), (55, "INFO", "50%"), (35, "WARNING", "89%"), (20, "WARNING", "100%")],
 )
 def test_outdoor_depth_and_what_is_clipped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, max_depth_m: float, level: str | None, share: str
