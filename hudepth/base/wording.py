@@ -43,11 +43,18 @@ def one_line(error: BaseException, task: str) -> str:
         if line := _config_line(cause, task):
             return line
     for cause in chain:
-        if isinstance(cause, OSError) and cause.errno in _FIXES:
-            name = f"'{cause.filename}'" if cause.filename else "a file"
-            return f"{name} cannot be written ({os.strerror(cause.errno)}). {_FIXES[cause.errno]}"
+        if isinstance(cause, OSError) and (line := unwritten(cause)):
+            return line
     message = " ".join(str(error).split()) or type(error).__name__
     return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
+
+
+def unwritten(error: OSError) -> str:
+    """Return the line of a file that could not be written; empty for other errors."""
+    if error.errno not in _FIXES:
+        return ""
+    name = f"'{error.filename}'" if error.filename else "a file"
+    return f"{name} cannot be written ({os.strerror(error.errno)}). {_FIXES[error.errno]}"
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

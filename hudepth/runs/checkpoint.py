@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from hudepth.base.errors import CheckpointError, TrainingError
 from hudepth.base.files import written_whole
 from hudepth.models.build import build_network
 from hudepth.runs import bundles
-from hudepth.runs.run import best_checkpoint, find_run, is_run, newest_run
+from hudepth.runs.run import LAST, best_checkpoint, find_run, is_run, newest_run
 from hudepth.runs.sections import check_config
 
 KEY = "hudepth"
@@ -31,14 +32,17 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write a checkpoint. Raises TrainingError if that is not possible; the previous one is intact."""
+        folder, why = Path(path).parent, "the disk is full, or a file may not be so large"
         try:
             with written_whole(Path(path)) as part:
                 torch.save(checkpoint, part)
-        except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
-            raise TrainingError(
-                f"the checkpoint '{path}' could not be saved ({_first_line(error)}). The previous one is intact: "
-                f"free some space, then resume with hudepth-train resume={Path(path).parent.parent}"
-            ) from error
+        except (OSError, RuntimeError) as error:
+            if not re.search(r"unexpected pos|iostream|file write failed", str(error)):  # torch's for a full disk
+                why = getattr(error, "strerror", None) or _first_line(error)
+            last = f"The previous one is intact: free some space, then resume with hudepth-train resume={folder.parent}"
+            if not (folder / LAST).is_file():
+                last = "It is the first one: free some space, then train again."
+            raise TrainingError(f"the checkpoint '{path}' could not be saved ({why}). {last}") from error
 
 
 @dataclass(frozen=True)

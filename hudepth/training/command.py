@@ -20,6 +20,7 @@ from hudepth.base.devices import is_first_process
 from hudepth.base.errors import CheckpointError, ConfigError, HudepthError, Pruned
 from hudepth.base.launched import shared_path
 from hudepth.base.options import plain
+from hudepth.base.wording import unwritten
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.environment import environment
@@ -159,8 +160,10 @@ def _run(training: Training) -> float | None:
         _write_failure(path, str(error) if expected else f"{type(error).__name__}: {error}")
         if not isinstance(error, OSError):
             raise
-        why = f"{error.strerror or error} ('{error.filename or path}')"
-        raise ConfigError(f"{why}. See {path / 'train.log'}.") from error
+        error.filename = error.filename or str(path)
+        why = unwritten(error) or f"{error.strerror or error} ('{error.filename}')."
+        more = f"Resume with hudepth-train resume={path}" if training.last.is_file() else f"See {path / 'train.log'}."
+        raise ConfigError(f"{why} {more}") from error
     _write_status(path, "finished", best=best)
     return best
 

@@ -106,6 +106,24 @@ def test_an_output_that_cannot_be_written_gives_one_line(command: Command, tmp_p
     assert done.err.splitlines()[-1].endswith("Pass paths.runs=<a folder you can write to>.")
 
 
+def test_a_disk_that_fills_up_says_how_to_go_on(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, rows: list[Any]) -> None:
+        if len(rows) > 1:
+            raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("hudepth.training.callbacks.write_history", write)
+    done = command("train", *TINY, "name=full", "test=false", "callbacks.panels=0", "logger=none")
+    run = only_run(tmp_path, "full")
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        f"hudepth-train: '{run / 'metrics.csv'}' cannot be written (No space left on device). Free some space, or pass "
+        f"a folder on another disk. Resume with hudepth-train resume={run}"
+    )
+    assert status(run)["state"] == "failed"
+
+
 def test_a_size_the_network_cannot_take_gives_the_nearest(command: Command) -> None:
     done = command("train", *TINY, "data.size=[40,48]")
     assert done.code == 1
