@@ -7,20 +7,20 @@ import hashlib
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from filelock import FileLock
 from numpy.typing import NDArray
 
 from hudepth.base.console import log, track
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import written_whole
 from hudepth.base.machine import largest_file
-from hudepth.base.options import convert
+from hudepth.base.options import Range, convert, parse
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres, values_per_metre
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.sources.contents import hash_contents
@@ -33,6 +33,26 @@ UNIT_SAMPLES = 16
 """Number of pairs whose depth is checked for a plausible unit beforehand."""
 
 OnError = Literal["raise", "skip"]
+
+
+@dataclass(frozen=True)
+class _Info:
+    """What commands read of a store's ``info``."""
+
+    source: str
+    fingerprint: str
+    encoding: str
+    pairs: int
+    depth_min_m: float
+    depth_median_m: float
+    depth_max_m: float
+    valid_fraction: float
+    native_sizes: list[Annotated[tuple[int, int], Range(1)]]
+    skipped: list[str]
+    depth_percentiles_m: list[float] | None = None
+    no_reading: float = 0.0
+
+
 _NONE = np.empty(0, np.uint8)
 
 
@@ -52,6 +72,8 @@ def build_once(path: Path, build: Callable[[Path], None]) -> None:
 
     Raises DataError if it cannot be written.
     """
+    if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
+        raise DataError(f"paths.cache: '{path}' is no regular file. Delete it and prepare again.")
     try:
         if not path.exists():  # try without the lock first, for caches that are read-only
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,6 +114,11 @@ def prepare(
     path = store_path(source, size=size, native=native, cache=Path(cache).expanduser())
     build_once(path, partial(_build, source, size=size, native=native, on_error=on_error, workers=workers))
     store = DepthStore(path)
+    try:
+        store.info["skipped"] = parse(_Info, store.info).skipped
+    except ConfigError as error:
+        what = str(error).partition(". ")[0]
+        raise DataError(f"'{path}' is damaged: its info's {what}. Delete it and prepare again.") from error
     if (skipped := store.info["skipped"]) and on_error == "raise":
         raise DataError(
             f"{source.name}: {len(skipped)} pairs could not be read, the first: "

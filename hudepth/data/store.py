@@ -24,6 +24,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.options import TrainSize, convert
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess
+from hudepth.data.sources.hdf5 import own_array
 
 FORMAT = "hudepth-depth-store"
 VERSION = 2
@@ -42,6 +45,7 @@ MM_PER_M = 1000
 OUTDOOR_PER_M = 256
 """Stored values per metre of a set that is not indoors, as KITTI stores them: up to 255.996 m."""
 MAX_STORED = int(np.iinfo(np.uint16).max)
+_AGAIN = "Delete it and prepare again."
 _TEXTS = ("id", "scene", "split", "category")
 
 
@@ -153,6 +157,24 @@ class StoreWriter:
             self._file.close()
 
 
+def _read_layout(file: h5py.File) -> tuple[list[Record], tuple[int, int], bool]:
+    """Return records, (height, width) and whether there is native truth; ValueError or the like if a part is amiss."""
+    count, *size = own_array(file, "image", "u1", (None, None, None, 3)).shape[:3]
+    size = convert("its size", size, TrainSize)
+    own_array(file, "depth", "u2", (count, *size))
+    columns = [own_array(file, f"records/{field}", "O", (count,)).asstr()[:] for field in _TEXTS]
+    frames = own_array(file, "records/frame", "i8", (count,))[:].tolist()
+    if "native" in file:
+        total = len(own_array(file, "native/png", "u1", (None,)))
+        ends = [0, *own_array(file, "native/end", "i8", (count,))[:].tolist(), total + 1]
+        if any(after <= before for before, after in pairwise(ends)):
+            raise ValueError("the ends of its native truths do not rise")
+    if len(set(columns[0])) < count:
+        raise ValueError("ids repeat")
+    rows = (dict(zip(("frame", *_TEXTS), row, strict=True)) for row in zip(frames, *columns, strict=True))
+    return [Record(**row) for row in rows], size, "native" in file
+
+
 class DepthStore:
     """A depth store, opened for reading. Worker processes can be given it: each opens its own handle on first use.
 
@@ -164,25 +186,15 @@ class DepthStore:
         self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)
         try:
             with h5py.File(self.path, "r") as file:
-                if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
-                    raise DataError(
-                        f"'{self.path}' is not a depth store of version {VERSION}. Delete it and prepare again."
-                    )
+                if (file.attrs.get("format"), file.attrs.get("version")) != (FORMAT, VERSION):
+                    raise DataError(f"'{self.path}' is not a depth store of version {VERSION}. {_AGAIN}")
                 self.info: dict[str, Any] = json.loads(file.attrs["info"])
-                self.size: tuple[int, int] = tuple(file["image"].shape[1:3])
-                self.per_m = int(file.attrs.get("per_metre", MM_PER_M))
-                """Stored depths are so many to the metre."""
-                if self.per_m < 1:
-                    raise ValueError(f"per_metre is {self.per_m}")
-                columns = [file[f"records/{field}"].asstr()[:] for field in _TEXTS]
-                frames = file["records/frame"][:].tolist()
-                self.has_native = "native" in file
-            self.records = [
-                Record(frame=frame, **dict(zip(_TEXTS, texts, strict=True)))
-                for frame, *texts in zip(frames, *columns, strict=True)
-            ]
-        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-            fix = "Delete it and prepare again."
+                self.per_m = int(file.attrs.get("per_metre", MM_PER_M))  # stored depths are so many to the metre
+                self.records, self.size, self.has_native = _read_layout(file)
+            if self.per_m not in (MM_PER_M, OUTDOOR_PER_M):
+                raise ValueError(f"per_metre is {self.per_m}")
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError, ConfigError) as error:
+            fix = _AGAIN
             if "lock file" in str(error):  # a disk over the network that has no locks
                 fix = "Set the environment variable HDF5_USE_FILE_LOCKING=FALSE, or pass paths.cache=<a local folder>."
             raise DataError(f"'{self.path}' cannot be read as a depth store ({error}). {fix}") from error
@@ -198,9 +210,12 @@ class DepthStore:
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
         file = self._handle.get(self.path)
-        for source, target in ((file["image"], images), (file["depth"], depths)):
-            for row, index in enumerate(indices):
-                source.read_direct(target, np.s_[index], np.s_[row])
+        try:
+            for source, target in ((file["image"], images), (file["depth"], depths)):
+                for row, index in enumerate(indices):
+                    source.read_direct(target, np.s_[index], np.s_[row])
+        except (OSError, RuntimeError) as error:
+            raise DataError(f"'{self.path}' is damaged ({error}). {_AGAIN}") from error
         return images, depths
 
     def read_ahead(self, first: int, last: int) -> None:
@@ -230,7 +245,6 @@ class DepthStore:
         ends = file["native/end"]
         start = int(ends[index - 1]) if index else 0
         stored = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
-        if stored is None:
-            name = self.records[index].id
-            raise DataError(f"'{self.path}': the ground truth of '{name}' is damaged. Delete it and prepare again.")
+        if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
+            raise DataError(f"'{self.path}': the ground truth of '{self.records[index].id}' is damaged. {_AGAIN}")
         return stored.astype(np.float32) / np.float32(self.per_m)

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import pickle
 import tempfile
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -267,6 +268,59 @@ def test_an_unfinished_file(tmp_path: Path) -> None:
 def _drop_frames(file: h5py.File) -> None:
     del file["records/frame"]
     file["records/frame"] = np.zeros(3, np.int64)
+
+
+def _replace(name: str, change: Callable[[np.ndarray], Any]) -> Callable[[h5py.File], None]:
+    def damage(file: h5py.File) -> None:
+        values = file[name][()]
+        del file[name]
+        file[name] = change(values)
+
+    return damage
+
+
+def _text(*values: str) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda _: np.array(values, dtype=h5py.string_dtype())
+
+
+@pytest.mark.parametrize(
+    ("damage", "what"),
+    [
+        (_replace("image", lambda values: values[:-1]), "'depth' is uint16"),
+        (_replace("depth", lambda values: values[:-3]), "'depth' is uint16 of shape"),
+        (_replace("depth", lambda values: values[:, :2]), "'depth' is uint16 of shape"),
+        (_replace("depth", lambda values: values.astype("f4")), "'depth' is float32"),
+        (_replace("image", lambda values: values.astype("f4")), "'image' is float32"),
+        (_replace("image", lambda _: np.zeros((7, 3, 5000, 3), np.uint8)), "size: .* at most 2048 pixels"),
+        (_replace("native/end", lambda values: values[::-1]), "ends of its native truths"),
+        (_replace("native/end", lambda values: values + 10**12), "ends of its native truths"),
+        (_replace("native/end", lambda values: values[:2]), "'native/end' is int64"),
+        (_replace("native/png", lambda values: values.astype("u2")), "'native/png' is uint16"),
+        (_replace("records/id", _text(*"aabcdef")), "ids repeat"),
+        (_replace("records/frame", lambda values: values + 0.5), "'records/frame' is float64"),
+        (lambda file: file.attrs.__setitem__("per_metre", 7), "per_metre is 7"),
+        (lambda file: file.attrs.__setitem__("info", "[" * 20_000), "recursion"),
+        (lambda file: (file.pop("image"), file.__setitem__("image", h5py.ExternalLink("b.h5", "image"))), "no array"),
+    ],
+)
+def test_parts_that_disagree(filled: tuple[Any, ...], damage: Any, what: str) -> None:
+    path = filled[0].path
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(DataError, match=rf"cannot be read as a depth store \(.*{what}.*Delete it and prepare again\."):
+        DepthStore(path)
+
+
+@pytest.mark.parametrize("content", [b"x" * 40, png(np.ones((2, 2, 3), np.uint8)), png(np.ones((2, 2), np.uint8))])
+def test_native_truth_that_is_no_16_bit_png(filled: tuple[Any, ...], content: np.ndarray) -> None:
+    store = filled[0]
+    bytes_ = np.frombuffer(bytes(content), np.uint8)
+    with h5py.File(store.path, "r+") as file:
+        del file["native/png"], file["native/end"]
+        file["native/png"] = np.tile(bytes_, 7)
+        file["native/end"] = len(bytes_) * np.arange(1, 8)
+    with pytest.raises(DataError, match="ground truth of '00' is damaged"):
+        DepthStore(store.path).read_native(0)
 
 
 @pytest.mark.parametrize(

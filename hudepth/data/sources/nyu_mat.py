@@ -11,12 +11,13 @@ import h5py
 import numpy as np
 
 from hudepth.base.errors import DataError
-from hudepth.base.images import MAX_PIXELS, check_pixels
+from hudepth.base.images import check_pixels
 from hudepth.base.options import Choice
 from hudepth.data.encoding import Encoding
 from hudepth.data.sources import nyu
 from hudepth.data.sources.base import EncodedSource, RawPair, Record, existing_root
 from hudepth.data.sources.files import PerProcess, make_pair
+from hudepth.data.sources.hdf5 import own_array
 
 _FILE = "nyu_depth_v2_labeled.mat"
 _MAX_NAME = 256
@@ -96,7 +97,8 @@ class NyuMatSource(nyu.Nyu, EncodedSource):
 
     def _arrays(self, path: Path) -> tuple[h5py.Dataset, h5py.Dataset]:
         file = self._handle.get(path)
-        return _dataset(file, "images", "u1", 4, path), _dataset(file, self.depth, "f", 3, path)
+        images = _dataset(file, "images", "u1", (None, 3, None, None), path)
+        return images, _dataset(file, self.depth, "f", (None, None, None), path)
 
 
 def _open(path: Path) -> h5py.File:
@@ -106,18 +108,13 @@ def _open(path: Path) -> h5py.File:
         raise DataError(f"'{path}': not an HDF5 file, or truncated. Copy the file again.") from None
 
 
-def _dataset(file: h5py.File, name: str, kind: str, ndim: int, path: Path) -> h5py.Dataset:
-    """Return a dataset with values of the expected type that are in this file, not in one it links to."""
-    link = file.get(name, getlink=True)
-    found = file.get(name) if isinstance(link, h5py.HardLink) else None
-    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-        raise DataError(f"'{path}': no array '{name}'. Pass data.root=<path of {_FILE}>.")
-    if found.ndim != ndim or not found.dtype.str[1:].startswith(kind) or (ndim == 4 and found.shape[1] != 3):
-        what = f"'{name}' is {found.dtype} of shape {found.shape}"
-        raise DataError(f"'{path}': {what}. Pass data.root=<path of {_FILE}>.")
+def _dataset(file: h5py.File, name: str, kind: str, shape: tuple[int | None, ...], path: Path) -> h5py.Dataset:
+    try:
+        found = own_array(file, name, kind, shape)
+    except ValueError as error:
+        fix = "Repack the file." if "chunks" in str(error) else f"Pass data.root=<path of {_FILE}>."
+        raise DataError(f"'{path}': {error}. {fix}") from None
     check_pixels(found.shape[-1], found.shape[-2], where=f"'{path}' {name}")
-    if found.chunks and np.prod(found.chunks, dtype=float) > 3 * MAX_PIXELS:  # a chunk is decompressed as a whole
-        raise DataError(f"'{path}': '{name}' has chunks of {found.chunks} values. Repack the file.")
     return found
 
 
