@@ -112,7 +112,8 @@ def _check_fits(path: Path, info: ModelInfo, found: dict[str, Any]) -> None:
     if not info.processing:
         takes, returns = ("float32", [3, height, width]), ("float32", [1, height, width])
     for what, wanted, given in (("take", takes, found["inputs"]), ("return", returns, found["outputs"])):
-        if [(kind, shape[1:]) for kind, shape in given] != [wanted]:
+        one_batch = what == "take" and any(isinstance(shape[0], int) and shape[0] >= 0 for _, shape in given if shape)
+        if one_batch or [(kind, shape[1:]) for kind, shape in given] != [wanted]:
             stated = ", ".join(f"{kind} {shape}" for kind, shape in given)
             raise CheckpointError(
                 f"'{path}': its description does not fit its graph, which should {what} {wanted[0]} [batch, "

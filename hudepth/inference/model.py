@@ -9,11 +9,11 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from PIL import Image
 
-from hudepth.base.errors import ConfigError
+from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.images import Photo, as_rgb, pillow_rgb, read_photo
 from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Choice, Range, Size, parse
@@ -74,14 +74,21 @@ class DepthModel:
         return Prepared(photo, fit_image(photo.rgb, self.info.size, fit=self.fit, aspect=self.info.aspect))
 
     def run(self, batch: Sequence[Prepared]) -> Float[np.ndarray, "b h w"]:
-        """Return depth [m] at the network's size."""
+        """Return depth [m] at the network's size; raises CheckpointError if it is not finite, or negative."""
         images = np.stack([each.fitted.rgb for each in batch])
-        depth = self.backend(images)
+        depth = self._depth(images)
         if not self.flip:
             return depth
-        mirrored = self.backend(np.ascontiguousarray(images[:, :, ::-1]))[:, :, ::-1]
+        mirrored = self._depth(np.ascontiguousarray(images[:, :, ::-1]))[:, :, ::-1]
         mean: Float[np.ndarray, "b h w"] = (depth + mirrored) / np.float32(2)
         return mean
+
+    def _depth(self, images: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
+        depth = self.backend(images)
+        if not 0 <= float(depth.min()) <= float(depth.max()) < np.inf:  # also NaN
+            why = "its depths are not finite and positive, so its weights are damaged. Pass another model."
+            raise CheckpointError(f"checkpoint: {self.info.name}: {why}")
+        return depth
 
     def finish(self, prepared: Prepared, depth_m: Float[np.ndarray, "h w"]) -> DepthMap:
         """Resize the network's depth to the image's size."""

@@ -37,7 +37,9 @@ def test_damaged_files(name: str, content: bytes, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def crafted(path: Path, last: list[Any], kind: str = "FLOAT", *, shape: Any = ("b", 32, 48), side: int = 32) -> Path:
+def crafted(
+    path: Path, last: list[Any], kind: str = "FLOAT", *, shape: Any = ("b", 32, 48), side: int = 32, batch: Any = "b"
+) -> Path:
     """Write a graph from bytes of 32 x 48 to their mean ``d``, then the nodes ``last``, then ``out``."""
     helper, types = pytest.importorskip("onnx").helper, pytest.importorskip("onnx").TensorProto
     nodes = [helper.make_node("Cast", ["image"], ["f"], to=types.FLOAT),
@@ -47,7 +49,7 @@ def crafted(path: Path, last: list[Any], kind: str = "FLOAT", *, shape: Any = ("
     given += [helper.make_tensor("count", types.INT64, [], [2**62]), helper.make_tensor("true", types.BOOL, [], [True])]
     names = {"out": getattr(types, kind)} if kind != "TWO" else {"out": types.FLOAT, "d": types.FLOAT}
     outputs = [helper.make_tensor_value_info(name, each, shape) for name, each in names.items()]
-    image = helper.make_tensor_value_info("image", types.UINT8, ["b", 32, 48, 3])
+    image = helper.make_tensor_value_info("image", types.UINT8, [batch, 32, 48, 3])
     model = helper.make_model(helper.make_graph(nodes, "g", [image], outputs, initializer=given),
                               opset_imports=[helper.make_opsetid("", 18)])  # fmt: skip
     model.ir_version = 9
@@ -80,6 +82,7 @@ def test_a_crafted_graph_that_is_sound(backend: str, tmp_path: Path) -> None:
         "string",
         "scalar",
         "loop",
+        "batch",
     ],
 )
 def test_graphs_that_are_not_what_they_say(kind: str, backend: str, tmp_path: Path) -> None:
@@ -94,6 +97,8 @@ def test_graphs_that_are_not_what_they_say(kind: str, backend: str, tmp_path: Pa
         crafted(path, [node("ReduceMean", "d", keepdims=0)], shape=())
     elif kind == "loop":
         crafted(path, [endless()])
+    elif kind == "batch":
+        crafted(path, [node("Identity", "d")], shape=(7, 32, 48), batch=7)
     else:
         crafted(path, [node("Cast", "d", to=getattr(types, kind.upper()))], kind.upper())
     with pytest.raises(CheckpointError, match=r"x\.onnx") as caught:
@@ -123,3 +128,10 @@ def test_a_graph_that_fills_memory(tmp_path: Path) -> None:
     path = crafted(tmp_path / "x.onnx", [*bomb, node("ReduceMax", "x", "first", keepdims=0)])
     with pytest.raises(CheckpointError):
         hudepth.load(path, backend="onnxruntime")
+
+
+@pytest.mark.parametrize("kind", ["Neg", "Log"])
+def test_depths_that_are_none_are_refused(kind: str, tmp_path: Path) -> None:
+    model = hudepth.load(crafted(tmp_path / "x.onnx", [node(kind, "d")]), backend="onnxruntime")
+    with pytest.raises(CheckpointError, match="not finite and positive"):
+        model.predict(np.full((20, 30, 3), 7 * (kind == "Neg"), np.uint8))
