@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.options import plain
@@ -46,6 +46,7 @@ def _main(task: str) -> int:
     debug = [argument for argument in arguments if argument in ("debug=true", "debug=false")]
     try:
         sys.argv[1:] = rewrite(task, [argument for argument in arguments if argument not in debug])
+        _check_flags(sys.argv[1:])
         _check_groups(sys.argv[1:])
         return _run_hydra(task)
     except KeyboardInterrupt:
@@ -115,6 +116,26 @@ def _quote_path(argument: str, *, multirun: bool) -> str:
     return f"{key}='{escaped}'"
 
 
+def _check_flags(arguments: list[str]) -> None:
+    """Refuse what Hydra's parser does not take, for which it would print how it is used.
+
+    Raises:
+        ConfigError: for these, and for shell completion without saying for which shell.
+    """
+    from hydra._internal.utils import get_args_parser
+
+    def refuse(message: str) -> NoReturn:
+        dashed = next((each.lstrip("-") for each in arguments if re.match(r"--?[^=]+=", each)), "")
+        fix = f"Pass {dashed}, without dashes." if dashed else "Write key=value, after flags such as --cfg job."
+        raise ConfigError(f"{message}. {fix}")
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    given = parser.parse_args(arguments)
+    if given.shell_completion and not re.match("(un)?install=|query=", " ".join(given.overrides)):
+        raise ConfigError("--shell-completion: what is missing. Pass -sc install=bash, or uninstall=bash.")
+
+
 def _check_groups(arguments: list[str]) -> None:
     """Refuse what Hydra would misread: several choices of a group, of which it would take parts of each.
 
@@ -123,7 +144,7 @@ def _check_groups(arguments: list[str]) -> None:
     """
     for argument in arguments:
         group, _, name = argument.partition("=")
-        key = group.lstrip("+")
+        key = group.lstrip("+~")
         if name and not name.startswith("~") and (conf_folder() / key).is_dir() and not re.search(r"[()$]", name):
             choices = name.strip("[]").split(",")
             if not all(_WORD.fullmatch(each.strip()) for each in choices):

@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import sys
+import traceback
 from collections.abc import Iterator
 from typing import Any
 
@@ -68,6 +69,8 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
 def _config_line(error: BaseException, task: str) -> str | None:
     """Word the errors of Hydra and OmegaConf, with suggestions."""
     module = type(error).__module__.partition(".")[0]
+    if module == "builtins" and (frames := list(traceback.walk_tb(error.__traceback__))):  # a ValueError of Hydra's
+        module = str(frames[-1][0].f_globals.get("__name__")).partition(".")[0]
     if module not in ("hydra", "omegaconf", "antlr4"):
         return None
     text = str(error)
