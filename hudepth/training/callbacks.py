@@ -100,39 +100,43 @@ class EpochLine(Callback):
 
 
 class Interrupt(Callback):
-    """Lets Ctrl-C end a run between two batches; a second Ctrl-C ends it at once.
+    """Lets Ctrl-C, or SIGTERM, end a run between two batches; a second one ends it at once.
 
     A KeyboardInterrupt raised at an arbitrary place can be lost: in the callback of a weak reference, of which drawing
-    has many, it is printed and ignored, and training continues. A worker of a launcher that was killed ends in the same
-    way, so that another process can resume the sweep.
+    has many, it is printed and ignored, and training continues. Lightning ignores SIGTERM, with which clusters and
+    containers ask. A worker of a launcher that was killed ends in the same way, so that another process can resume the
+    sweep.
     """
 
-    _asked = False
-    _before: Any = None
+    asked = False
+    """Whether to stop."""
+
+    def __init__(self) -> None:
+        self._before: dict[signal.Signals, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Install the handler, in the main thread only: after Lightning, which restores what it found."""
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._ask)
+            self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def on_train_end(self, *_: Any, **__: Any) -> None:
-        """Restore the handler that was there before."""
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-            self._before = None
+        """Restore the handlers that were there before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
 
     on_exception = on_train_end
 
     def _ask(self, number: int, frame: Any) -> None:
-        if self._asked:
+        if self.asked:
             raise KeyboardInterrupt
-        self._asked = True
+        self.asked = True
         log.warning("stopping after this batch; Ctrl-C again stops at once")
 
     def on_train_batch_end(self, *_: Any, **__: Any) -> None:
         """Stop if asked to, or if the parent of this worker is gone."""
         parent = multiprocessing.parent_process()  # set for a worker of a pool, not for a shell's child
-        if self._asked or (parent is not None and os.getppid() != parent.pid):
+        if self.asked or (parent is not None and os.getppid() != parent.pid):
             raise KeyboardInterrupt
 
     on_validation_batch_end = on_train_batch_end

@@ -32,7 +32,7 @@ from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
 from hudepth.training.options import MEMORY_FORMATS
 from hudepth.training.schedules import StepSchedule
-from hudepth.training.trainer import build_callbacks, build_run_trainer
+from hudepth.training.trainer import build_callbacks, build_run_trainer, one_ending
 
 
 def fit(training: Training) -> float | None:
@@ -168,7 +168,8 @@ def run_epochs(training: Training, trainer: Trainer, module: DepthModule, data: 
         run_dir.write_resumed(training.path, config=training.config, overrides=training.overrides)
     with without_known_warnings():
         try:
-            trainer.fit(module, datamodule=data, ckpt_path=last, weights_only=True)
+            with one_ending(trainer):
+                trainer.fit(module, datamodule=data, ckpt_path=last, weights_only=True)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError, RuntimeError) as error:
             steps = read_plain(last).get("global_step") if last else None
             if trainer.global_step not in (0, steps) or last is None:

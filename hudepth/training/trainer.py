@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
 from hudepth.base.console import shows_progress
 from hudepth.base.devices import build_trainer
+from hudepth.base.errors import TrainingError
 from hudepth.base.instantiate import instantiate
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.pictures import evenly_spaced
@@ -63,3 +67,29 @@ def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Cal
         plugins=[AtomicCheckpointIO(), *([LightningEnvironment()] if alone else [])], default_root_dir=path,
         use_distributed_sampler=False,  # the data module divides the pairs among processes itself, exactly
     )  # fmt: skip
+
+
+@contextmanager
+def one_ending(trainer: Trainer) -> Iterator[None]:
+    """Let the processes of a training end together, with one message, if one of them cannot go on.
+
+    Raises KeyboardInterrupt if this process was asked to stop and another one was faster, whose connection is lost
+    then; TrainingError if another one failed.
+    """
+    others = getattr(trainer.strategy.launcher, "procs", [])
+    try:
+        yield
+    except BaseException as error:
+        for process in others:  # they would wait for this one
+            process.send_signal(signal.SIGKILL if os.name != "nt" else signal.SIGTERM)
+        if isinstance(error, RuntimeError):
+            if any(isinstance(each, Interrupt) and each.asked for each in trainer.callbacks):  # type: ignore[attr-defined]
+                raise KeyboardInterrupt from error
+            if trainer.world_size > 1 and re.search(r"gloo|nccl|peer", str(error), re.IGNORECASE):
+                raise TrainingError(
+                    f"another of the {trainer.world_size} processes of this training was killed, or failed as it says "
+                    f"above. Resume with hudepth-train resume={trainer.default_root_dir}"
+                ) from error
+        raise
+    finally:
+        others.clear()  # else Lightning, which watches them, would kill this process for their exit codes

@@ -212,33 +212,38 @@ def test_the_monitored_metric_is_shown_once() -> None:
 class PressesCtrlC(Callback):
     """Sends the signal where a KeyboardInterrupt would be lost, and counts what goes on after it."""
 
-    def __init__(self) -> None:
-        self.batches = 0
+    def __init__(self, number: int) -> None:
+        self.batches, self.number = 0, number
 
     def on_train_batch_start(self, *_: object) -> None:
         self.batches += 1
         dying = {object.__new__(type("Dying", (), {}))}
-        reference = weakref.ref(next(iter(dying)), lambda _: os.kill(os.getpid(), signal.SIGINT))
+        reference = weakref.ref(next(iter(dying)), lambda _: os.kill(os.getpid(), self.number))
         dying.clear()
         assert reference() is None
 
 
-def test_ctrl_c_is_as_it_was_after_training(data: DepthDataModule, tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGINT)
+BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+
+
+@BOTH
+def test_ctrl_c_is_as_it_was_after_training(number: int, data: DepthDataModule, tmp_path: Path) -> None:
+    before = signal.getsignal(number)
     fit(data, tmp_path, [Interrupt()], max_epochs=1)
-    assert signal.getsignal(signal.SIGINT) == before
+    assert signal.getsignal(number) == before
 
 
-def test_ctrl_c_ends_training_wherever_it_hits(data: DepthDataModule, tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    presses = PressesCtrlC()
+@BOTH
+def test_ctrl_c_ends_training_wherever_it_hits(number: int, data: DepthDataModule, tmp_path: Path) -> None:
+    before = signal.getsignal(number)
+    presses = PressesCtrlC(number)
     try:
         with pytest.raises(SystemExit):
             fit(data, tmp_path, [Interrupt(), presses], max_epochs=2)
         assert presses.batches == 1
-        assert signal.getsignal(signal.SIGINT) == before
+        assert signal.getsignal(number) == before
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------

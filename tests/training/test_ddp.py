@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -105,6 +108,24 @@ def test_a_run_of_two_processes_goes_on_as_if_never_stopped(tmp_path: Path, cach
     ours, theirs = (read_plain(path / "checkpoints" / "last.ckpt")["state_dict"] for path in (stopped, whole))
     assert ours.keys() == theirs.keys()
     assert all(bool((ours[name] == theirs[name]).all()) for name in ours)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM between processes")
+@pytest.mark.parametrize("to_all", [True, False], ids=["to both", "to the first"])
+@pytest.mark.slow
+def test_two_processes_end_together_when_asked_to(to_all: bool, tmp_path: Path, cache: Path) -> None:
+    options = (SEVEN, *TWO, "test=false", "callbacks.panels=0", "logger=none", "trainer.max_epochs=1000", "name=asked")
+    command = script("train", *TINY, *PAIRS, *options, cwd=tmp_path, cache=cache)
+    process = subprocess.Popen(**command, start_new_session=True)  # type: ignore[call-overload]
+    while not list(tmp_path.glob("runs/asked/*/checkpoints/last.ckpt")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    (os.killpg if to_all else os.kill)(process.pid, signal.SIGTERM)
+    out, _ = process.communicate(timeout=60)  # until both have closed their output
+    (made,) = (tmp_path / "runs" / "asked").iterdir()
+    assert process.returncode == 130
+    assert out.splitlines()[-1] == f"interrupted; resume with: hudepth-train resume={made}"
+    assert json.loads((made / "status.json").read_text())["state"] == "interrupted"
 
 
 @pytest.mark.slow
