@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 from hudepth.base.errors import DataError
-from hudepth.base.files import write_text
+from hudepth.base.files import read_json, write_text
 
 _THREADS = 8
 _SETTLED_NS = 2 * 10**9
@@ -30,7 +31,7 @@ def hash_contents(name: str, files: Sequence[Path], *, cache: Path) -> str:
         return ""
     folder = os.path.commonpath([file.absolute().parent for file in files])
     memo = cache / f"contents-{name}-{hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]}.json"
-    known = _read(memo)
+    known = _read_memo(memo)
     now = time.time_ns()
     with ThreadPoolExecutor(_THREADS) as pool:  # hashing and reading release the interpreter's lock
         found = list(pool.map(lambda file: _state(file, known), files))
@@ -45,10 +46,10 @@ def hash_contents(name: str, files: Sequence[Path], *, cache: Path) -> str:
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def _read(memo: Path) -> dict[str, Any]:
+def _read_memo(memo: Path) -> dict[str, Any]:
     try:
-        known = json.loads(memo.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        known = read_json(memo)
+    except (OSError, ValueError):
         return {}
     return known if isinstance(known, dict) else {}
 
@@ -57,6 +58,8 @@ def _state(file: Path, known: dict[str, Any]) -> tuple[Sequence[int], str]:
     """Return size, times and inode of a file, and the digest of its contents; ``()`` and a word if it is missing."""
     try:
         stat = file.stat()
+        if not S_ISREG(stat.st_mode):  # a device or a pipe never ends
+            return (), "missing"
         state = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
         entry = known.get(str(file))
         if isinstance(entry, list) and len(entry) == 5 and entry[:4] == state and isinstance(entry[4], str):

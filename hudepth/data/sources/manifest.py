@@ -92,7 +92,7 @@ class ManifestSource(FileSource):
         root = existing_root(self.root, expects=f"folder with {self.manifest}")
         if root.is_file():
             return root.parent, root
-        index = root / self.manifest
+        index = inside(root, self.manifest, where="data.source.manifest")
         if not index.is_file():
             raise DataError(
                 f"data.root: no file '{self.manifest}' in '{root}'. "

@@ -56,5 +56,17 @@ def test_only_what_changed_is_read_again(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(read) == 13
 
 
+def test_what_never_ends_is_not_read(tmp_path: Path) -> None:
+    source = write_set(tmp_path / "set", 2.0)
+    before = hash_contents(source.name, source.files(), cache=tmp_path)
+    file = tmp_path / "set/depths/1.npy"
+    file.unlink()
+    file.symlink_to("/dev/zero")
+    zeros = hash_contents(source.name, source.files(), cache=tmp_path)
+    file.unlink()
+    os.mkfifo(file)
+    assert zeros == hash_contents(source.name, source.files(), cache=tmp_path) != before
+
+
 def test_generated_sources_have_no_files(tmp_path: Path) -> None:
     assert hash_contents("rooms", RoomsSource(scenes=2).files(), cache=tmp_path) == ""

@@ -263,3 +263,12 @@ def test_lists_as_spreadsheets_write_them(tmp_path: Path, lines: tuple[str, ...]
 def test_own_validation_pairs(tmp_path: Path) -> None:
     write_list(tmp_path, "image,depth,split", "a,b,train", "c,d,val", "e,f,test")
     assert [record.split for record in ManifestSource(tmp_path).records()] == ["train", "val", "test"]
+
+
+@pytest.mark.parametrize("name", ["../other.csv", "/etc/passwd"])
+def test_a_list_outside_the_folder_is_not_read(tmp_path: Path, name: str) -> None:
+    (tmp_path / "set").mkdir()
+    (tmp_path / "other.csv").write_text("secret\n")
+    with pytest.raises(DataError, match=r"data\.source\.manifest") as caught:
+        ManifestSource(tmp_path / "set", manifest=name).records()
+    assert "secret" not in str(caught.value)
