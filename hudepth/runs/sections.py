@@ -21,18 +21,23 @@ class _Data:
 
 
 @dataclass(frozen=True)
+class _Extras:
+    extra: list[Part] | None = None
+
+
+@dataclass(frozen=True)
 class _Config:
     """What every configuration has; the parts themselves are checked by what is built from them."""
 
     model: Part
     data: _Data | None = None
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
-    loss: Part | None = None
-    optim: Part | None = None
+    loss: Part = field(default_factory=dict)
+    optim: Part = field(default_factory=dict)
     schedule: Part | None = None
     trainer: Part = field(default_factory=dict)
-    callbacks: Part = field(default_factory=dict)
-    logger: Part = field(default_factory=dict)
+    callbacks: _Extras = field(default_factory=_Extras)
+    logger: _Extras = field(default_factory=_Extras)
     protocol: Part | None = None
     augment: Part | None = None
     distill: Part | None = None

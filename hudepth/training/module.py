@@ -98,7 +98,11 @@ class DepthModule(LightningModule):
     def logged_names(self) -> list[str]:
         """Return the names of everything that is logged for an epoch; calls the loss to learn its terms."""
         depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
-        terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
+        try:
+            terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
+        except (TypeError, AttributeError) as error:  # one of torch's own, which takes two tensors and returns one
+            why = f"{type(self.loss).__name__} is not a loss of depth maps ({error})"
+            raise ConfigError(f"loss: {why}. Pass loss=l1, or write one as docs/extending.md shows.") from error
         names = [f"val/{name}" for name in validation_names()] + [loss_name("val", term) for term in terms]
         return names + [loss_name("train", term) for term in terms + ["distill"] * bool(self.distill)]
 

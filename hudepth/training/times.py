@@ -10,7 +10,7 @@ from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from hudepth.base.files import write_text
+from hudepth.base.files import read_text, write_text
 from hudepth.base.types import Batch
 
 COLUMNS = ("epoch", "height", "width", "images", "wall_s", "cpu_s", "lr")
@@ -63,9 +63,8 @@ class Times(Callback):
 def read_times(path: Path) -> list[dict[str, str]]:
     """Return the complete rows of a times.csv; none if it is missing or damaged."""
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return [row for row in csv.DictReader(file) if _is_complete(row)]
-    except (OSError, ValueError):
+        return [row for row in csv.DictReader(io.StringIO(read_text(path))) if _is_complete(row)]
+    except (OSError, ValueError, csv.Error):
         return []
 
 

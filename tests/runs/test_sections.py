@@ -19,7 +19,8 @@ LAST: dict[str, Any] = {
     ("key", "value"),
     [("seed", -1), ("seed", "x"), ("trainer", None), ("model", [1]), ("data", 3), ("loss", "l1"), ("monitor", {}),
      ("data", {"size": True}), ("data", {"size": [0, 1]}), ("data", {"size": [8192, 8192]}),
-     ("data", {"source": None}), ("callbacks", "x")],
+     ("data", {"source": None}), ("callbacks", "x"),
+     ("callbacks", {"extra": "x"}), ("logger", {"extra": [3]}), ("loss", None), ("optim", None)],
 )  # fmt: skip
 def test_a_part_of_another_type(key: str, value: Any) -> None:
     check_config(CONFIG, where=Path("config.yaml"))

@@ -12,7 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 
-from hudepth.base.errors import TrainingError
+from hudepth.base.errors import ConfigError, TrainingError
 from hudepth.base.types import LossTerms
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.sources.rooms import RoomsSource
@@ -54,6 +54,11 @@ def make_trainer(*callbacks: Callback, **options: Any) -> Trainer:
         callbacks=list(callbacks),
         **{"max_epochs": 1, **options},
     )
+
+
+def test_a_loss_of_another_kind_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"loss: L1Loss is not a loss of depth maps"):
+        make_module(nn.L1Loss()).logged_names()
 
 
 def test_what_is_logged(cache: Path) -> None:

@@ -125,16 +125,22 @@ def test_a_new_run_in_the_same_place_begins_anew(cache: Path, tmp_path: Path) ->
     [
         ("", []),
         ("rubbish", []),
+        (f"{HEADER}{'1' * 200_000}\n", []),
         (HEADER, []),
         ("epoch,step\n1,2\n", []),
         (HEADER + "1,32,48,8,1.00,2.00,0.01\n2,32,48,16,1", ["1"]),
         ("lr,cpu_s,wall_s,images,width,height,epoch,more\n0.1,2,1,8,48,32,1,x\n", ["1"]),
     ],
-    ids=["empty", "rubbish", "no rows", "other columns", "a row that breaks off", "in another order"],
+    ids=["empty", "rubbish", "a long value", "no rows", "other columns", "a row that breaks off", "in another order"],
 )
 def test_what_is_read_of_a_file(tmp_path: Path, text: str, epochs: list[str]) -> None:
     (tmp_path / "times.csv").write_text(text)
     assert [row["epoch"] for row in read_times(tmp_path / "times.csv")] == epochs
+
+
+def test_a_link_to_a_device_has_no_rows(tmp_path: Path) -> None:
+    (tmp_path / "times.csv").symlink_to("/dev/zero")
+    assert read_times(tmp_path / "times.csv") == []
 
 
 def test_no_file_has_no_rows(tmp_path: Path) -> None:
