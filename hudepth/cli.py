@@ -26,7 +26,7 @@ PATHS = {
 }  # fmt: skip
 """Options that are paths or names: their values are text, whatever Hydra's grammar would make of them."""
 
-_WORD = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_][\w./-]*", re.IGNORECASE)
+_WORD = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_][\w./-]{0,99}", re.IGNORECASE)
 """A choice of a group: nothing that Hydra reads as a number or a constant."""
 
 
@@ -148,7 +148,7 @@ def _check_groups(arguments: list[str]) -> None:
         if name and not name.startswith("~") and (conf_folder() / key).is_dir() and not re.search(r"[()$]", name):
             choices = name.strip("[]").split(",")
             if not all(_WORD.fullmatch(each.strip()) for each in choices):
-                raise ConfigError(f"{key}: no '{name}'. Pass one of {', '.join(options_of(key))}.")
+                raise ConfigError(f"{key}: no '{name[:40]}'. Pass one of {', '.join(options_of(key))}.")
             if name[0] == "[" and key not in ("protocol", *ADDED_GROUPS):
                 sweep = f"-m {group}={','.join(choices)}"
                 raise ConfigError(

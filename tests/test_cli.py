@@ -158,7 +158,7 @@ def test_several_choices_of_a_group_are_refused(command: Command) -> None:
     assert "hudepth-train: loss: takes one choice" in command("train", "loss=[l1,silog]").err
 
 
-@pytest.mark.parametrize("value", ["-1.5", "null", "true", "[[1]]", "[null]", "{a:1}", "nan"])
+@pytest.mark.parametrize("value", ["-1.5", "null", "true", "[[1]]", "[null]", "{a:1}", "nan", "x" * 5000])
 @pytest.mark.parametrize("group", ["model", "+optim", "protocol", "paths"])
 def test_what_is_no_name_is_no_choice_of_a_group(group: str, value: str, command: Command) -> None:
     done = command("test", "checkpoint=nyu", f"{group}={value}")

@@ -25,6 +25,8 @@ _FIXES = {
     errno.EFBIG: "Raise the limit of file sizes (ulimit -f), or pass a folder on another disk.",
     errno.EROFS: _FOLDER, errno.EACCES: _FOLDER, errno.EPERM: _FOLDER, errno.ENOTDIR: _FOLDER,
     errno.EIO: "Check the disk.",
+    errno.EISDIR: "Remove the folder of that name, or pass another.",
+    errno.ENAMETOOLONG: "Pass a shorter name.", errno.ELOOP: "Remove the link.",
 }  # fmt: skip
 """What to do about a file that could not be written, by the system's number of the error."""
 

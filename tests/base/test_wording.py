@@ -11,7 +11,14 @@ from hudepth.base.wording import one_line
 
 @pytest.mark.parametrize(
     ("code", "fix"),
-    [(errno.ENOSPC, "Free some space"), (errno.EROFS, "folder"), (errno.EACCES, "folder"), (errno.EFBIG, "ulimit")],
+    [
+        (errno.ENOSPC, "Free some space"),
+        (errno.EROFS, "folder"),
+        (errno.EACCES, "folder"),
+        (errno.EFBIG, "ulimit"),
+        (errno.EISDIR, "Remove the folder"),
+        (errno.ENAMETOOLONG, "shorter"),
+    ],
 )
 def test_a_file_that_cannot_be_written(code: int, fix: str) -> None:
     line = one_line(OSError(code, os.strerror(code), "runs/x/metrics.json"), "test")
