@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,7 @@ class Style:
 
 FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] = {
     "png16": ("_depth.png", lambda depth, file, _: file.write(depth.to_png16())),
-    "npy": ("_depth.npy", lambda depth, file, _: np.save(file, depth.metres)),
+    "npy": ("_depth.npy", lambda depth, file, _: file.write(npy(depth))),
     "colour": ("_depth.jpg", lambda depth, file, style: file.write(jpeg(depth.colourise(scale_m=style.scale_m)))),
     "side": ("_side.jpg", lambda depth, file, style: file.write(jpeg(depth.side_by_side(scale_m=style.scale_m)))),
     "ply": ("_depth.ply", lambda depth, file, style: file.write(depth.point_cloud(style.intrinsics).to_ply())),
@@ -52,6 +53,13 @@ def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Styl
             failed.append(f"no {name}: {error}")
     if failed:
         raise DataError(" ".join(failed))
+
+
+def npy(depth: DepthMap) -> bytes:
+    """Return a depth map in metres as a .npy file. NumPy, writing one itself, does not say why it cannot."""
+    memory = io.BytesIO()
+    np.save(memory, depth.metres)
+    return memory.getvalue()
 
 
 def jpeg(rgb: UInt8[np.ndarray, "h w 3"], *, quality: int = 92) -> bytes:

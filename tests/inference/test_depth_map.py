@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+import errno
+import sys
+from pathlib import Path
+
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from hudepth.inference.depth_files import FORMATS, Style, write_depth
 from hudepth.inference.depth_map import DepthMap
 
 shapes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)
@@ -37,3 +43,21 @@ def test_pictures_and_points() -> None:
     cloud = depth.point_cloud((500.0, 500.0, 32.0, 24.0))
     assert len(cloud.points_m) == metres.size
     assert "as given" in cloud.comment
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of file sizes")
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_says_why_it_cannot_be_written(name: str, tmp_path: Path) -> None:
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    metres = np.random.default_rng(0).random((48, 64), np.float32)
+    depth = DepthMap(metres, np.zeros((48, 64, 3), np.uint8), 10.0)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))  # the first bytes can be written
+        with pytest.raises(OSError, match="too large") as caught:
+            write_depth(tmp_path / "x", depth, [name], Style((0.0, 10.0)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.errno == errno.EFBIG
+    assert not list(tmp_path.iterdir())
