@@ -56,7 +56,6 @@ class Broadcast:
 Size = Annotated[tuple[int, int], Range(1), Broadcast(), "[height,width]"]
 """(height, width) in pixels; one number makes a square."""
 TrainSize = Annotated[tuple[int, int], Range(1, 2048), Broadcast(), "[height,width] of at most 2048 pixels each"]
-"""That of training images: what a checkpoint of others asks for must not fill the memory."""
 
 
 def parse(schema: type[T], values: Mapping[str, Any], *, prefix: str = "", strict: bool = False) -> T:
@@ -236,9 +235,10 @@ def _describe(hint: Any, bounds: str = "") -> str:
 def _show(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {True: "true", False: "false", None: "null"}[value]
+    text = f"'{value}'" if isinstance(value, str) else str(value)
     if _is_list(value):
-        return f"[{','.join(_show(item).strip(chr(39)) for item in value)}]"
-    return f"'{value}'" if isinstance(value, str) else str(value)
+        text = f"[{','.join(_show(item).strip(chr(39)) for item in value[:100])}]"
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _default(field: Any) -> Any:

@@ -93,7 +93,7 @@ def _config_line(error: BaseException, task: str) -> str | None:
         hint = "" if key in known else did_you_mean(key, known)  # a group, but of another task
         return f"no key '{key}'.{hint} See hudepth-{task} --cfg job for all keys.{plus}"
     if "Override" in type(error).__name__ or module == "antlr4" or "NoViableAlt" in text:
-        typed = getattr(error, "override", None) or text.split(": ", 1)[-1]
+        typed = str(getattr(error, "override", None) or text.split(": ", 1)[-1])[:200]
         return f"cannot read '{typed}': write key=value, and quote values with special characters: 'key=\"a, b\"'."
     return " ".join(text.split())
 

@@ -82,6 +82,8 @@ class DepthDataModule(LightningDataModule):
         prepare_workers: int | None = None,
     ) -> None:
         super().__init__()
+        split = convert("data.split", split, str)
+        fractions = convert("data.fractions", fractions, list[float])
         check_split(split, fractions)
         self.source, self.augment, self.teacher_folder = source, augment, teacher
         self.split_kind, self.fractions = split, tuple(fractions)
@@ -96,7 +98,7 @@ class DepthDataModule(LightningDataModule):
         self.shuffle_block: int | None = convert("data.shuffle_block", shuffle_block, _COUNT | None)
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
-        self.cache = Path(cache)
+        self.cache: Path = convert("data.cache", cache, Path)
         if self.on_error == "skip":
             source.unpaired = []
         self._draws: tuple[int, torch.Generator] | None = None

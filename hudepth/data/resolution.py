@@ -25,7 +25,7 @@ def read_stages(progressive: Sequence[Mapping[str, Any]], *, size: tuple[int, in
     Returns the stages whose images are smaller than the store's ``size``; others are skipped, so one plan serves more
     sizes. Raises ConfigError if an entry is malformed, or the shares do not rise.
     """
-    stages: list[Stage] = convert("data.progressive", list(progressive), list[Stage])
+    stages: list[Stage] = convert("data.progressive", progressive, list[Stage])
     for number, (before, stage) in enumerate(zip([0.0, *(stage.until for stage in stages)], stages, strict=False)):
         if stage.until <= before:
             raise ConfigError(

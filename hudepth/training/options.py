@@ -16,6 +16,10 @@ from hudepth.base.options import Range, parse
 MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
 
 
+_Share = Annotated[int, Range(0)] | Annotated[float, Range(0, 1)] | None
+"""A number of batches, or their share."""
+
+
 @dataclass(frozen=True)
 class TrainerOptions:
     """Arguments of ``lightning.Trainer`` with a type of their own; Lightning checks the others."""
@@ -26,6 +30,10 @@ class TrainerOptions:
     max_epochs: Annotated[int, Range(-1)] | None = None
     accumulate_grad_batches: Annotated[int, Range(1)] = 1
     gradient_clip_val: Annotated[float, Range(0)] | None = None
+    limit_train_batches: _Share = None
+    limit_val_batches: _Share = None
+    limit_test_batches: _Share = None
+    check_val_every_n_epoch: Annotated[int, Range(1)] | None = 1
 
     def __post_init__(self) -> None:
         if self.precision.startswith("64"):

@@ -140,3 +140,10 @@ def test_an_output_folder_must_be_writable(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="output: cannot write"):
         output_folder(tmp_path / "file" / "b")
+
+
+def test_a_long_value_is_shown_in_part() -> None:
+    for value in ("x" * 5000, list(range(3000))):
+        with pytest.raises(ConfigError) as caught:
+            convert("key", value, int)
+        assert len(str(caught.value)) < 300

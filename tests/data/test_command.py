@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from hudepth.data.store import DepthStore
-from tests.commands import TINY, Command
+from tests.commands import TINY, Command, script
 
 ROOMS = tuple(a for a in TINY if a.startswith("data.s"))
 
@@ -65,3 +67,11 @@ def test_bad_files_are_named_or_skipped(command: Command, tmp_path: Path) -> Non
     assert skipped.code == 0
     assert skipped.out.startswith("9 pairs in ")
     assert "folder: 1 pairs skipped:" in skipped.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("override", ["data.progressive=-inf", "data.fractions=none", "data.split=[null,null]"])
+def test_an_option_of_another_type_is_named(override: str, tmp_path: Path, cache: Path) -> None:
+    done = subprocess.run(**script("data", "info", "data=rooms", override, cwd=tmp_path, cache=cache), check=False)
+    assert done.returncode == 1
+    assert done.stdout.startswith(f"hudepth-data: {override.partition('=')[0]}: ")

@@ -42,7 +42,8 @@ def test_options_that_old_runs_lack_have_defaults(config: dict[str, Any]) -> Non
         ("callbacks.panels_every_n_epochs", 0, "at least 1"), ("callbacks.extra", 3, "list"),
         ("logger.tensorboard", "no", "true or false"), ("trainer.accumulate_grad_batches", 0, "at least 1"),
         ("trainer.gradient_clip_val", -1, "at least 0"), ("trainer.precision", "bf16-true", "loses updates"),
-        ("trainer.max_epochs", 2.5, "whole number"),
+        ("trainer.max_epochs", 2.5, "whole number"), ("trainer.limit_val_batches", "/", "number"),
+        ("trainer.limit_train_batches", -1, "number"), ("trainer.limit_test_batches", 1.5, "number"),
     ],
 )  # fmt: skip
 def test_mistakes(config: dict[str, Any], key: str, value: Any, word: str) -> None:
