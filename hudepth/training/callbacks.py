@@ -33,6 +33,14 @@ def epoch_metrics(trainer: Trainer) -> dict[str, float]:
     return {name: value.item() for name, value in metrics if validated or not name.startswith("val/")}
 
 
+class LogLosses(Callback):
+    """Logs the epoch's training losses before other callbacks read them: the module's own hook comes after theirs."""
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log them."""
+        pl_module.log_losses("train")  # type: ignore[operator]
+
+
 class History(Callback):
     """Writes metrics.csv, one row per epoch, and keeps the rows in every checkpoint.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from hudepth.losses.distillation import Distillation
 from hudepth.metrics.collection import validation_metrics, validation_names
 from hudepth.runs import checkpoint as ckpt
 from hudepth.training.averaging import averaged_state
+from hudepth.training.means import EpochMeans
 from hudepth.training.schedules import StepSchedule
 
 CHECK_EVERY = {"cpu": 1}
@@ -75,6 +77,7 @@ class DepthModule(LightningModule):
         self._record = record or {}
         self._unchecked: list[_Step] = []
         self._emptied: list[_Step] = []  # in this epoch
+        self._losses = {"train": EpochMeans(), "val": EpochMeans()}
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Predict unit depth from normalised images."""
@@ -116,23 +119,27 @@ class DepthModule(LightningModule):
         if self.distill is not None and "teacher" in batch:
             terms["distill"] = self.distill(pred, batch["teacher"])
             total = total + self.distill.weight * terms["distill"]
-        values = {loss_name(stage, term): value.detach() for term, value in {"total": total, **terms}.items()}
-        # A float: Lightning averages the number of images over processes in the number's own type. From 7 images in two
-        # processes it would make 3 per process, and a loss too high by a sixth.
-        size: Any = float(len(pred))
-        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True, batch_size=size)
+        values = {loss_name(stage, term): value for term, value in {"total": total, **terms}.items()}
+        self._losses[stage].add(values, images=len(pred))  # Lightning's log() would cost a tenth of a small step
         if stage == "val":
             depth_m = (x.float() * self.max_depth_m for x in (pred, batch["unit_depth"]))
             self.val_metrics.update(*depth_m, batch["valid"])
         return total
 
     def on_validation_epoch_end(self) -> None:
-        """Log the metrics of the whole validation subset."""
+        """Log losses and metrics of the whole validation subset."""
+        self.log_losses("val")
         self.log_dict({k: v.float() for k, v in self.val_metrics.compute().items()}, sync_dist=True)
         self.val_metrics.reset()
 
+    def log_losses(self, stage: str) -> None:
+        """Log the losses of an epoch, ``train`` or ``val``, unless it was done, as by the callback LogLosses."""
+        means = self._losses[stage].take(partial(self.trainer.strategy.reduce, reduce_op="sum"))
+        self.log_dict(means, sync_dist=True)
+
     def on_train_epoch_end(self) -> None:
         """Check the remaining losses and the weights, before anything is saved."""
+        self.log_losses("train")
         self._check_losses()
         self._check_emptied()
         if not bool(torch.stack([each.detach().isfinite().all() for each in self.net.parameters()]).all()):

@@ -23,7 +23,7 @@ from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.pictures import evenly_spaced
 from hudepth.runs import history
 from hudepth.runs.checkpoint import AtomicCheckpointIO
-from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, PanelPictures
+from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
 from hudepth.training.checkpointing import FullSizeEarlyStopping, checkpoint_callbacks
 from hudepth.training.loggers import drop_on_failure
 from hudepth.training.study import TRIAL_ENV, TrialPruner
@@ -34,7 +34,7 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
     """Build the callbacks of a run in a directory: history before checkpoints, which hold it."""
     options, monitor, mode = config["callbacks"], config["monitor"], config["mode"]
     callbacks: list[Callback] = [
-        Interrupt(), EpochSeed(config["seed"]), History(path / history.FILE), Times(path / "times.csv"),
+        Interrupt(), EpochSeed(config["seed"]), LogLosses(), History(path / history.FILE), Times(path / "times.csv"),
         EpochLine(monitor),
     ]  # fmt: skip
     if options["panels"]:

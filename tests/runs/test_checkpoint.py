@@ -27,7 +27,7 @@ from hudepth.data.sources.rooms import RoomsSource
 from hudepth.losses import BADCL
 from hudepth.models import HybridUNet, TinyUNet
 from hudepth.runs.checkpoint import KEY, VERSION, AtomicCheckpointIO, find_checkpoint, load_checkpoint, read_plain
-from hudepth.training.callbacks import History
+from hudepth.training.callbacks import History, LogLosses
 from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 
@@ -62,6 +62,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         enable_progress_bar=False,
         num_sanity_val_steps=0,
         callbacks=[
+            LogLosses(),
             History(folder / "metrics.csv"), *checkpoint_callbacks(folder, monitor="val/abs_rel", mode="min")
         ],
         plugins=[AtomicCheckpointIO()],

@@ -26,7 +26,7 @@ from hudepth.models import TinyUNet
 from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
 from hudepth.runs.history import read_history
 from hudepth.training.averaging import EMA, averaged_state
-from hudepth.training.callbacks import History
+from hudepth.training.callbacks import History, LogLosses
 from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 
@@ -54,6 +54,7 @@ def fit(cache: Path, run: Path, callbacks: Sequence[Callback], *, resume: bool =
     trainer = Trainer(
         accelerator="cpu", enable_model_summary=False, enable_progress_bar=False, num_sanity_val_steps=0,
         callbacks=[
+            LogLosses(),
             History(run / "metrics.csv"), *callbacks, *checkpoint_callbacks(run, monitor="val/abs_rel", mode="min")
         ],
         plugins=[AtomicCheckpointIO()], max_epochs=epochs, logger=False,

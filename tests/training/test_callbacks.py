@@ -32,7 +32,7 @@ from hudepth.models import TinyUNet
 from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
 from hudepth.runs.history import read_history
 from hudepth.training import callbacks
-from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, PanelPictures
+from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
 from hudepth.training.checkpointing import checkpoint_callbacks
 from hudepth.training.module import DepthModule
 from hudepth.viz.panels import Panel
@@ -67,6 +67,7 @@ def fit(
         enable_progress_bar=False,
         num_sanity_val_steps=0,
         callbacks=[
+            LogLosses(),
             History(run / "metrics.csv"), *extra, *checkpoint_callbacks(run, monitor="val/abs_rel", mode="min")
         ],
         plugins=[AtomicCheckpointIO()],
