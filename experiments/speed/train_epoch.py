@@ -38,15 +38,15 @@ from hudepth.training.options import MEMORY_FORMATS
 from hudepth.training.trainer import build_callbacks, build_run_trainer
 
 
-def read_config(options: argparse.Namespace) -> dict[str, Any]:
-    overrides = [
-        f"+experiment={options.experiment}", f"data.size=[{options.size},{options.size}]", "data.native=false",
-        f"data.source.scenes={-(-options.batches * 8 * 5 // 14)}", "data.split=random", "data.progressive=null",
-        "model.weights=none", "logger=none", "callbacks.panels=0", "trainer.max_epochs=1",
-        "trainer.limit_val_batches=0", "trainer.accelerator=cpu", *options.overrides,
+def read_config(experiment: str, *, size: int, overrides: list[str]) -> dict[str, Any]:
+    """Return the configuration of a training of one epoch on rooms, without validation and pictures."""
+    fixed = [
+        f"+experiment={experiment}", f"data.size=[{size},{size}]", "data.native=false", "data.split=random",
+        "data.progressive=null", "model.weights=none", "logger=none", "callbacks.panels=0", "trainer.max_epochs=1",
+        "trainer.limit_val_batches=0", "trainer.accelerator=cpu",
     ]  # fmt: skip
     with initialize_config_module("hudepth.conf", version_base="1.3"):
-        config: Any = OmegaConf.to_container(compose("train", overrides), resolve=True)
+        config: Any = OmegaConf.to_container(compose("train", [*fixed, *overrides]), resolve=True)
     return dict(config)
 
 
@@ -86,11 +86,15 @@ class Stopwatch(Callback):
 def real_epoch(config: dict[str, Any], data: DepthDataModule, net: torch.nn.Module) -> float:
     """Train one epoch as hudepth-train does, without validation; return its seconds."""
     watch = Stopwatch()
+    fit_epoch(config, data, net, watch)
+    return watch.seconds
+
+
+def fit_epoch(config: dict[str, Any], data: DepthDataModule, net: torch.nn.Module, watch: Callback) -> None:
     with tempfile.TemporaryDirectory() as folder, without_known_warnings(), quiet():
         callbacks = build_callbacks({**config, "monitor": "train/loss/total"}, Path(folder), data)
         trainer = build_run_trainer(config, Path(folder), [watch, *callbacks], alone=True)
         trainer.fit(new_module(config, data, net), datamodule=data)
-    return watch.seconds
 
 
 @contextlib.contextmanager
@@ -126,7 +130,8 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*", help="of the configuration, for example trainer.precision=bf16-mixed")
     options = parser.parse_args()
 
-    config = read_config(options)
+    scenes = f"data.source.scenes={-(-options.batches * 8 * 5 // 14)}"
+    config = read_config(options.experiment, size=options.size, overrides=[scenes, *options.overrides])
     keep_freed_memory()
     data = build_data(config["data"], trust=[], augment=config["augment"])
     data.prepare_data()

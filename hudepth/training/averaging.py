@@ -35,6 +35,28 @@ class EMA(WeightAveraging):
         if self._average_model is not None:
             self._average_model.n_averaged = self._average_model.n_averaged.cpu()  # read at every step
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Pair the tensors of both networks once: at every step, as Lightning does, it takes longer than averaging."""
+        assert self._average_model is not None
+        both = [[*net.parameters(), *net.buffers()] for net in (self._average_model.module, pl_module)]
+        self._pairs = [
+            [[x for x in tensors if x.is_floating_point() is kind] for tensors in both] for kind in (True, False)
+        ]
+
+    @torch.no_grad()
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Average after every step of the optimiser."""
+        if trainer.global_step <= self._latest_update_step:
+            return
+        assert self._average_model is not None
+        for averaged, current in self._pairs:
+            if self._average_model.n_averaged == 0:
+                torch._foreach_copy_(averaged, current)
+            elif averaged:
+                self._average(averaged, current, self._average_model.n_averaged)
+        self._average_model.n_averaged += 1
+        self._latest_update_step = trainer.global_step
+
     @torch.no_grad()
     def _average(self, averaged: Sequence[Tensor], current: Sequence[Tensor], count: Tensor | int) -> None:
         steps = self._latest_update_step  # not ``count``: reading it would wait for the device
