@@ -2,7 +2,7 @@
 
 On a GPU the host launches the kernels of a step one by one, so what it does besides them slows training down. This can
 be measured without a GPU: one thread, images of 32 x 32, one at a time. Trains epochs in turns, as hudepth-train does
-and in a bare loop over batches in memory, and prints the processor time of a step in each [ms] and the median of the
+and in a bare loop over batches in memory, and prints the median processor time of a step in each [ms] and that of the
 differences. Validation, pictures and checkpoints are left out.
 
     python experiments/speed/step_overhead.py [--experiments badcl strong] [--steps 150] [--pairs 5]
@@ -15,6 +15,7 @@ import statistics
 import time
 from typing import Any
 
+import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -27,13 +28,13 @@ SMALL = ["data.batch_size=1", "data.source.frames_per_scene=10", "data.source.si
 
 
 class StepClock(Callback):
-    """Processor time from the first training batch to the last [s]."""
+    """Processor time between the starts of training batches [s]."""
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.start = time.process_time()
+        self.times: list[float] = []
 
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.seconds = time.process_time() - self.start
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        self.times.append(time.process_time())
 
 
 def measure(experiment: str, *, steps: int, pairs: int) -> None:
@@ -43,15 +44,14 @@ def measure(experiment: str, *, steps: int, pairs: int) -> None:
     data.prepare_data()
     net = instantiate(config["model"])
     batches = [preprocess(raw, max_depth_m=data.max_depth_m) for raw in data.train_dataloader()]
-    bare_epoch(config, data, net, batches[:20])  # warm-up
     bare, real = [], []
-    for _ in range(pairs):
-        start = time.process_time()
-        bare_epoch(config, data, net, batches)
-        bare.append(1000 * (time.process_time() - start) / len(batches))
-        clock = StepClock()
+    for number in range(pairs + 1):
+        clock, times = StepClock(), []
+        bare_epoch(config, data, net, batches, each_step=lambda times=times: times.append(time.process_time()))
         fit_epoch(config, data, net, clock)
-        real.append(1000 * clock.seconds / len(batches))
+        if number:  # the first pair warms up
+            bare.append(1000 * statistics.median(np.diff(times)))
+            real.append(1000 * statistics.median(np.diff(clock.times)))
     extra = [r - b for r, b in zip(real, bare, strict=True)]
     print(
         f"| {experiment} | {statistics.median(bare):.1f} | {statistics.median(real):.1f} "

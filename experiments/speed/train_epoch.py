@@ -16,7 +16,7 @@ import copy
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,14 @@ def new_module(config: dict[str, Any], data: DepthDataModule, net: torch.nn.Modu
     return build_module(config, copy.deepcopy(net), data, trust=[])
 
 
-def bare_epoch(config: dict[str, Any], data: DepthDataModule, net: torch.nn.Module, batches: list[Batch]) -> float:
+def bare_epoch(
+    config: dict[str, Any],
+    data: DepthDataModule,
+    net: torch.nn.Module,
+    batches: list[Batch],
+    *,
+    each_step: Callable[[], None] | None = None,
+) -> float:
     """Train one epoch by hand on batches in memory; return its seconds."""
     module = new_module(config, data, net)
     optimizer = module._make_optimizer(module.net.named_parameters())
@@ -62,6 +69,8 @@ def bare_epoch(config: dict[str, Any], data: DepthDataModule, net: torch.nn.Modu
     module.train()
     start = time.perf_counter()
     for batch in batches:
+        if each_step:
+            each_step()
         optimizer.zero_grad()
         with torch.autocast("cpu", torch.bfloat16, enabled=precision.startswith("bf16")):
             pred = module.net(batch["image"])

@@ -14,6 +14,7 @@ from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
 from lightning.pytorch.utilities import rank_zero_only
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.machine import resolve_precision
 
 GPUS = {
     "gpu": (CUDAAccelerator, MPSAccelerator),
@@ -62,7 +63,9 @@ def build_trainer(options: Mapping[str, Any], **fixed: Any) -> Trainer:
     """
     check_devices(options)
     try:
-        return Trainer(**options, **fixed)
+        asked, accelerator = (str(options.get(key, "auto")) for key in ("precision", "accelerator"))
+        known = {"precision": resolve_precision(asked, accelerator).precision} if "precision" in options else {}
+        return Trainer(**{**options, **known}, **fixed)
     except (TypeError, ValueError, MisconfigurationException) as error:
         raise ConfigError(f"trainer: {error}") from error
 

@@ -6,10 +6,11 @@ import ctypes
 import math
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hudepth.base.errors import ConfigError
 
@@ -54,6 +55,49 @@ def torch_device(name: str, *, among: Sequence[str] = ("cuda", "mps", "cpu")) ->
     if name != "auto" and name not in here:
         raise ConfigError(f"device: no '{name}' here. Pass device={' or '.join(reversed(here))}.")
     return torch.device(here[0] if name == "auto" else name)
+
+
+def uses_cuda(accelerator: str) -> bool:
+    """Return whether a Trainer with this ``accelerator`` computes on an NVIDIA GPU."""
+    import torch
+
+    return accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
+
+
+class Arithmetic(NamedTuple):
+    """How a training computes: ``precision`` of Lightning's Trainer, and whether float32 products use TF32."""
+
+    precision: str
+    tf32: bool = False
+
+
+def resolve_precision(precision: str, accelerator: str) -> Arithmetic:
+    """Return what ``trainer.precision`` means on a device.
+
+    ``tf32``: float32, with matrix products and convolutions in TF32 on NVIDIA GPUs. ``fast``: bf16-mixed on those that
+    have it, else the same. Lightning's names keep their meaning; 32-true is float32 without TF32.
+    """
+    import torch
+
+    on_cuda = uses_cuda(accelerator)
+    if precision == "fast" and on_cuda and torch.cuda.is_bf16_supported(including_emulation=False):
+        return Arithmetic("bf16-mixed", tf32=True)
+    return Arithmetic("32-true", tf32=on_cuda) if precision in ("fast", "tf32") else Arithmetic(precision)
+
+
+@contextmanager
+def float32_products(*, tf32: bool) -> Iterator[None]:
+    """Compute products of float32 matrices, and convolutions, in TF32 on NVIDIA GPUs, or not."""
+    import torch
+
+    before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+    try:
+        torch.set_float32_matmul_precision("high" if tf32 else "highest")
+        torch.backends.cudnn.allow_tf32 = tf32
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before[0])
+        torch.backends.cudnn.allow_tf32 = before[1]
 
 
 def hardware() -> dict[str, Any]:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hudepth.base.console import log
+from hudepth.base.machine import float32_products
 from hudepth.base.masked import widen
 from hudepth.models.decoder import Head, UpBlock, split_kernel
 
@@ -37,7 +38,7 @@ def inference_form(net: nn.Module, *, size: tuple[int, int]) -> nn.Module:
     fused.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     device = next((parameter.device for parameter in net.parameters()), torch.device("cpu"))
     image = torch.randn(1, 3, *size, generator=torch.Generator().manual_seed(0)).to(device)
-    with torch.inference_mode():
+    with torch.inference_mode(), float32_products(tf32=False):
         difference = float((plain(image) - fused(image)).abs().max())
     if not difference <= TOLERANCE:
         log.debug("%s: not rewritten, its output would change by %g", type(net).__name__, difference)

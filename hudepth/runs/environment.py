@@ -9,14 +9,15 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from hudepth.base.machine import resolve_precision, uses_cuda
+
 PACKAGES = ("hudepth", "torch", "lightning", "torchmetrics", "hydra-core", "h5py", "numpy", "opencv-python-headless")
 
 
-def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
-    """Return what it takes to repeat a run: versions, git state, device, threads, seed, command."""
+def environment(*, seed: int, accelerator: str, precision: str) -> dict[str, Any]:
+    """Return what it takes to repeat a run: versions, git state, device, arithmetic, threads, seed, command."""
     import torch
 
-    uses_gpu = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -24,7 +25,8 @@ def environment(*, seed: int, accelerator: str) -> dict[str, Any]:
         "packages": {**{name: _version(name) for name in PACKAGES}, "torch": str(torch.__version__)},
         "git": _git(),
         "accelerator": accelerator,
-        "device": torch.cuda.get_device_name() if uses_gpu else _processor(),
+        "device": torch.cuda.get_device_name() if uses_cuda(accelerator) else _processor(),
+        **resolve_precision(precision, accelerator)._asdict(),
         "threads": torch.get_num_threads(),
         "seed": seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],

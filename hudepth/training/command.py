@@ -57,7 +57,9 @@ def train(cfg: DictConfig) -> float | None:
     with lock, _shared_with_children(path), run_dir.log_to_file(path / "train.log"):
         if training.overrides is None and is_first_process():
             options = training.options
-            found = environment(seed=options.seed, accelerator=options.trainer.accelerator)
+            found = environment(
+                seed=options.seed, accelerator=options.trainer.accelerator, precision=options.trainer.precision
+            )
             run_dir.write_start(path, config=training.config, overrides=_overrides(), environment=found)
         return _run(training)
 

@@ -15,7 +15,7 @@ from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
 from hudepth.base.instantiate import has_target, import_trusted, instantiate
-from hudepth.base.machine import keep_freed_memory
+from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision
 from hudepth.base.options import parse
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
@@ -30,7 +30,7 @@ from hudepth.runs.checkpoint import load_checkpoint, read_plain
 from hudepth.training.initial import Parents, Training, restore_parents
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
-from hudepth.training.options import MEMORY_FORMATS
+from hudepth.training.options import memory_format
 from hudepth.training.schedules import StepSchedule
 from hudepth.training.trainer import build_callbacks, build_run_trainer, one_ending
 
@@ -44,7 +44,8 @@ def fit(training: Training) -> float | None:
     import_trusted(options.trust)
     data = build_datamodule(training)
     net = build_network(config["model"], trust=options.trust)
-    net.to(memory_format=MEMORY_FORMATS[options.memory_format])  # type: ignore[call-overload]
+    arithmetic = resolve_precision(options.trainer.precision, options.trainer.accelerator)
+    net.to(memory_format=memory_format(options.memory_format, arithmetic))  # type: ignore[call-overload]
     check_input(net, data.sizes)
     restore_split(training, data)
     parents = restore_parents(training, net, data)
@@ -60,7 +61,8 @@ def fit(training: Training) -> float | None:
         trainer = build_run_trainer(config, path, callbacks, alone=training.alone)
     check_shares(trainer, subset="validation", pairs=len(data.split.val))
     log_start(trainer, module, data)
-    run_epochs(training, trainer, module, data)
+    with float32_products(tf32=arithmetic.tf32):
+        run_epochs(training, trainer, module, data)
     if options.test and trainer.fast_dev_run:  # type: ignore[attr-defined]  # set by Lightning's connector
         log.info("trainer.fast_dev_run: no checkpoint was written, so nothing is tested")
     elif options.test and trainer.is_global_zero:  # like hudepth-test does: on one device, in full precision

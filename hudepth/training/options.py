@@ -11,9 +11,17 @@ import torch
 
 from hudepth.base.devices import check_devices
 from hudepth.base.errors import ConfigError
+from hudepth.base.machine import Arithmetic
 from hudepth.base.options import Range, parse
 
 MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
+
+
+def memory_format(name: str, arithmetic: Arithmetic) -> torch.memory_format:
+    """Return the layout of the network; ``auto`` is channels-last where ``fast`` means bfloat16."""
+    if name == "auto":
+        name = "channels_last" if arithmetic == ("bf16-mixed", True) else "contiguous"
+    return MEMORY_FORMATS[name]
 
 
 _Share = Annotated[int, Range(0)] | Annotated[float, Range(0, 1)] | None
@@ -26,7 +34,7 @@ class TrainerOptions:
 
     accelerator: str = "auto"
     num_nodes: Annotated[int, Range(1)] = 1
-    precision: str = "32-true"
+    precision: str = "tf32"
     max_epochs: Annotated[int, Range(-1)] | None = None
     accumulate_grad_batches: Annotated[int, Range(1)] = 1
     gradient_clip_val: Annotated[float, Range(0)] | None = None
@@ -43,7 +51,7 @@ class TrainerOptions:
         if self.precision.endswith("16-true"):
             raise ConfigError(
                 f"trainer.precision: {self.precision} keeps the weights in 16 bits, which loses updates. "
-                "Pass bf16-mixed, 16-mixed or 32-true."
+                "Pass tf32, fast, bf16-mixed, 16-mixed or 32-true."
             )
 
 
@@ -80,7 +88,7 @@ class TrainOptions:
     trust: list[str]
     baselines: bool = True
     init: str | None = None
-    memory_format: Literal["contiguous", "channels_last"] = "contiguous"
+    memory_format: Literal["auto", "contiguous", "channels_last"] = "auto"
     compile: bool = False
     variant: str | None = None
     sweep_dir: str | None = None

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from hudepth.base import machine
 
@@ -79,3 +80,39 @@ def test_freed_memory_is_kept() -> None:
 def test_freed_memory_is_not_kept_where_nothing_knows_how(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine.ctypes, "CDLL", lambda _: object())
     assert not machine.keep_freed_memory()
+
+
+@pytest.mark.parametrize(
+    ("precision", "accelerator", "cuda", "bfloat16", "expected"),
+    [
+        ("tf32", "auto", True, True, ("32-true", True)),
+        ("tf32", "cpu", True, True, ("32-true", False)),
+        ("fast", "gpu", True, True, ("bf16-mixed", True)),
+        ("fast", "gpu", True, False, ("32-true", True)),
+        ("fast", "auto", False, False, ("32-true", False)),
+        ("fast", "mps", True, True, ("32-true", False)),
+        ("32-true", "gpu", True, True, ("32-true", False)),
+        ("16-mixed", "gpu", True, True, ("16-mixed", False)),
+    ],
+)
+def test_what_a_precision_means_on_a_device(
+    precision: str, accelerator: str, cuda: bool, bfloat16: bool, expected: tuple[str, bool],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: bfloat16)
+    assert machine.resolve_precision(precision, accelerator) == expected
+
+
+def test_products_in_tf32_end_with_the_block() -> None:
+    def state() -> tuple[str, bool]:
+        return torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+
+    before = state()
+    with pytest.raises(KeyError), machine.float32_products(tf32=True):
+        assert state() == ("high", True)
+        with machine.float32_products(tf32=False):
+            assert state() == ("highest", False)
+        assert state() == ("high", True)
+        raise KeyError
+    assert state() == before

@@ -13,10 +13,11 @@ from hudepth.runs import environment
 
 
 def test_environment_is_plain_and_complete() -> None:
-    found = environment.environment(seed=7, accelerator="cpu")
+    found = environment.environment(seed=7, accelerator="cpu", precision="fast")
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["seed"] == 7
     assert found["accelerator"] == "cpu"
+    assert (found["precision"], found["tf32"]) == ("32-true", False)
     assert found["threads"] == torch.get_num_threads()
     assert found["packages"]["torch"] == torch.__version__
     assert all(found[key] for key in ("python", "platform", "device", "command"))
@@ -24,7 +25,7 @@ def test_environment_is_plain_and_complete() -> None:
 
 def test_a_package_of_another_build_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(environment, "PACKAGES", ("torch", "a-package-nobody-has"))
-    assert environment.environment(seed=0, accelerator="cpu")["packages"] == {
+    assert environment.environment(seed=0, accelerator="cpu", precision="fast")["packages"] == {
         "torch": torch.__version__,
         "a-package-nobody-has": None,
     }
@@ -56,7 +57,7 @@ def no_repository_above(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def git_state() -> object:
-    return environment.environment(seed=0, accelerator="cpu")["git"]
+    return environment.environment(seed=0, accelerator="cpu", precision="fast")["git"]
 
 
 @pytest.mark.usefixtures("no_repository_above")
