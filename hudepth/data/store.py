@@ -19,11 +19,11 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import TrainSize, convert
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess
-from hudepth.data.sources.hdf5 import own_array
+from hudepth.data.sources.hdf5 import RowFile, own_array
 
 FORMAT = "hudepth-depth-store"
 VERSION = 2
@@ -184,6 +184,7 @@ class DepthStore:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)
+        self._rows = PerProcess(partial(RowFile, names=("image", "depth")))
         try:
             with h5py.File(self.path, "r") as file:
                 if (file.attrs.get("format"), file.attrs.get("version")) != (FORMAT, VERSION):
@@ -209,27 +210,18 @@ class DepthStore:
         """
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
-        file = self._handle.get(self.path)
         try:
-            for source, target in ((file["image"], images), (file["depth"], depths)):
-                for row, index in enumerate(indices):
-                    source.read_direct(target, np.s_[index], np.s_[row])
-        except (OSError, RuntimeError) as error:
+            rows = self._rows.get(self.path)
+            for name, target in (("image", images), ("depth", depths)):
+                for place, index in enumerate(indices):
+                    rows.read(name, index, target[place])
+        except (OSError, RuntimeError, ValueError) as error:
             raise DataError(f"'{self.path}' is damaged ({error}). {_AGAIN}") from error
         return images, depths
 
     def read_ahead(self, first: int, last: int) -> None:
         """Ask the system to read the pairs from ``first`` to ``last`` in one go, if it takes such hints."""
-        if not hasattr(os, "posix_fadvise"):
-            return
-        file = self._handle.get(self.path)
-        with self.path.open("rb") as raw:
-            for name in ("image", "depth"):
-                data = file[name]
-                start, row = data.id.get_offset(), data.dtype.itemsize * math.prod(data.shape[1:])
-                if start is not None:  # else not in one piece
-                    length = (last - first + 1) * row
-                    os.posix_fadvise(raw.fileno(), start + first * row, length, os.POSIX_FADV_WILLNEED)
+        self._rows.get(self.path).read_ahead(first, last)
 
     def read_native(self, index: int) -> NDArray[np.float32]:
         """Read one ground truth at its native resolution: [H, W] metres, 0 where unmeasured.

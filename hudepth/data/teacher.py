@@ -21,6 +21,7 @@ from hudepth.data.sources.base import Record
 from hudepth.data.sources.contents import hash_contents
 from hudepth.data.sources.decoding import read_depth
 from hudepth.data.sources.files import PerProcess
+from hudepth.data.sources.hdf5 import RowFile
 from hudepth.data.store import DepthStore
 
 ENDINGS = (".npy", ".png", "_depth.npy", "_depth.png")
@@ -50,14 +51,14 @@ class TeacherDepths:
         key = [store.path.name, hash_contents("teacher", files, cache=store.path.parent), rows]
         self.path = store.path.with_name(f"teacher-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5")
         build_once(self.path, partial(_prepare, files, store))
-        self._handle: PerProcess[h5py.File] = PerProcess(h5py.File)
+        self._rows = PerProcess(partial(RowFile, names=("depth",)))
 
     def read(self, indices: Sequence[int]) -> NDArray[np.float32]:
         """Read the depths at positions in the depth store: [n, h, w], 0 where there is none."""
         depths = np.empty((len(indices), *self.size), np.float32)
-        source = self._handle.get(self.path)["depth"]
-        for row, index in enumerate(indices):
-            source.read_direct(depths, np.s_[self._position[index]], np.s_[row])
+        rows = self._rows.get(self.path)
+        for place, index in enumerate(indices):
+            rows.read("depth", self._position[index], depths[place])
         return depths
 
 
