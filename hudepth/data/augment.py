@@ -18,6 +18,8 @@ from hudepth.data.warp import Geometry, cut_border, resize, warp
 
 _Share = Annotated[float, Range(0, 1)]
 _Factor = Annotated[Sequence[float], Range(0, 10), "[lowest,highest] within 0 and 10"]
+_DRAWS = 21
+"""Random numbers that an image takes if everything is changed."""
 _SPANS = ("zoom", "gamma", "brightness", "contrast", "saturation")
 
 
@@ -137,14 +139,15 @@ class Augmentation:
 
 
 class _Draw:
-    """Random numbers, one per image: drawn on the CPU, used on the device."""
+    """Random numbers, one per image: drawn on the CPU all at once, used on the device."""
 
     def __init__(self, count: int, generator: torch.Generator, device: torch.device) -> None:
-        self.count, self.generator, self.device = count, generator, device
+        self.generator = generator
+        self._rows = iter(torch.rand(_DRAWS, count, generator=generator).to(device, non_blocking=True))
 
     def uniform(self, low: float, high: float) -> Tensor:
-        numbers = torch.rand(self.count, generator=self.generator)
-        return (low + (high - low) * numbers).to(self.device, non_blocking=True)
+        numbers: Tensor = next(self._rows)
+        return numbers * (high - low) + low
 
     def log_uniform(self, low: float, high: float) -> Tensor:
         return self.uniform(math.log(low), math.log(high)).exp()

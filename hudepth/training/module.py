@@ -22,6 +22,7 @@ from hudepth.metrics.collection import validation_metrics, validation_names
 from hudepth.runs import checkpoint as ckpt
 from hudepth.training.averaging import averaged_state
 from hudepth.training.means import EpochMeans
+from hudepth.training.optim import fit_state
 from hudepth.training.schedules import StepSchedule
 
 CHECK_EVERY = {"cpu": 1}
@@ -193,7 +194,9 @@ class DepthModule(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
 
     def on_train_start(self) -> None:
-        """Refuse to resume with a schedule that was laid out over another number of steps."""
+        """Check what was restored: the optimiser's state, and over how many steps the schedule was laid out."""
+        for optimizer in self.trainer.optimizers:
+            fit_state(optimizer)
         scheduler = self.lr_schedulers() if self._make_scheduler else None
         steps = self.trainer.estimated_stepping_batches
         if isinstance(scheduler, StepSchedule) and scheduler.total_steps != steps:

@@ -6,10 +6,27 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-from torch import nn
-from torch.optim import AdamW
+import torch
+from torch import Tensor, nn
+from torch.optim import AdamW, Optimizer
 
 from hudepth.base.errors import ConfigError
+
+
+def fit_state(optimizer: Optimizer) -> None:
+    """Lay out a restored state as the parameters are: fused updates go through memory without looking.
+
+    Raises ValueError if a part has another shape than its parameter.
+    """
+    for parameter, state in optimizer.state.items():
+        for key, value in state.items():
+            if not isinstance(value, Tensor) or value.ndim == 0:
+                continue
+            if value.shape != parameter.shape:
+                shapes = " x ".join(map(str, value.shape)), " x ".join(map(str, parameter.shape))
+                raise ValueError(f"the optimiser's {key} is {shapes[0]}, its parameter {shapes[1]}")
+            if value.stride() != parameter.stride():
+                state[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
 class GroupedAdamW(AdamW):

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
 from hudepth.models import HybridUNet
-from hudepth.training.optim import GroupedAdamW
+from hudepth.training.optim import GroupedAdamW, fit_state
 
 
 class Net(nn.Module):
@@ -145,3 +145,32 @@ def test_a_factor_that_is_none(factor: float) -> None:
     with pytest.raises(ConfigError) as caught:
         GroupedAdamW(Net().named_parameters(), lr=1e-3, encoder_lr_factor=factor)
     assert str(caught.value).startswith(f"optim.encoder_lr_factor: {factor} ")
+
+
+def stepped(layout: torch.memory_format, state: dict[str, Any] | None = None) -> tuple[torch.optim.AdamW, Tensor]:
+    """Take a step of a fused AdamW with the same weights and gradients in a layout, from a state if there is one."""
+    torch.manual_seed(0)
+    weight, gradient = torch.randn(4, 3, 2, 2), torch.randn(4, 3, 2, 2)
+    parameter = nn.Parameter(weight.to(memory_format=layout))
+    optimizer = torch.optim.AdamW([parameter], lr=0.1, fused=True)
+    if state:
+        optimizer.load_state_dict(state)
+        fit_state(optimizer)
+    parameter.grad = gradient.to(memory_format=layout)
+    optimizer.step()
+    return optimizer, parameter.detach()
+
+
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_a_state_of_another_layout_counts_the_same(layout: torch.memory_format) -> None:
+    expected = [stepped(layout, stepped(other)[0].state_dict())[1] for other in (layout, torch.contiguous_format)]
+    found = stepped(layout, stepped(torch.channels_last)[0].state_dict())[1]
+    for each in expected:
+        torch.testing.assert_close(found, each, rtol=0, atol=0)
+
+
+def test_a_state_of_another_shape_is_refused() -> None:
+    optimizer, _ = stepped(torch.contiguous_format)
+    next(iter(optimizer.state.values()))["exp_avg"] = torch.zeros(7)
+    with pytest.raises(ValueError, match="exp_avg is 7, its parameter 4 x 3 x 2 x 2"):
+        fit_state(optimizer)

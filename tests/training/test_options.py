@@ -23,7 +23,7 @@ def changed(config: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
 
 def test_the_configuration_of_the_package_is_valid(config: dict[str, Any]) -> None:
     options = parse_options(config)
-    assert (options.seed, options.mode, options.memory_format) == (42, "min", "contiguous")
+    assert (options.seed, options.mode, options.memory_format) == (42, "min", "auto")
     assert (options.trainer.max_epochs, options.callbacks.panels, options.logger.tensorboard) == (30, 6, True)
 
 
