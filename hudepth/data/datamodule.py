@@ -18,10 +18,10 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from hudepth.base.console import log
 from hudepth.base.errors import DataError
-from hudepth.base.options import Range, TrainSize, convert
+from hudepth.base.options import Choice, Range, TrainSize, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
-from hudepth.data.dataset import BlockShuffle, LateLoader, ShardSampler, StoreDataset, as_is
+from hudepth.data.dataset import BlockShuffle, DeviceDataset, LateLoader, ShardSampler, StoreDataset, as_is, on_device
 from hudepth.data.prepare import OnError, prepare, share_beyond
 from hudepth.data.preprocess import preprocess
 from hudepth.data.resolution import read_stages, size_at
@@ -53,6 +53,7 @@ class DepthDataModule(LightningDataModule):
             ``[{size: [112, 112], until: 0.4}]``; see :func:`hudepth.data.resolution.read_stages`.
         teacher: folder of another model's depths; see :class:`hudepth.data.teacher.TeacherDepths`.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
+        on_device: keep the training pairs in the device's memory; ``auto``: on a GPU, if half of what is free suffices.
         seed: of the order of training pairs and of augmentation, which depend only on it and the epoch.
         shuffle_block: for stores larger than memory: shuffle blocks of so many neighbouring pairs, then the pairs
             within a few blocks; see :class:`hudepth.data.dataset.BlockShuffle`.
@@ -74,6 +75,7 @@ class DepthDataModule(LightningDataModule):
         augment: Augmentation | None = None,
         teacher: str | Path | None = None,
         num_workers: int = 0,
+        on_device: bool | str = "auto",
         seed: int = 42,
         shuffle_block: int | None = None,
         cache: str | Path = "~/.cache/hudepth",
@@ -94,6 +96,8 @@ class DepthDataModule(LightningDataModule):
         self.max_depth_m: float = convert("data.max_depth_m", max_depth_m, Annotated[float, Range(0, above=True)])
         self.batch_size: int = convert("data.batch_size", batch_size, _COUNT)
         self.num_workers: int = convert("data.num_workers", num_workers, Annotated[int, Range(0, MAX_WORKERS)])
+        choices = Annotated[str, Choice(("auto", "true", "false"))]
+        self.on_device: str = convert("data.on_device", str(on_device).lower(), choices)
         self.prepare_workers: int | None = convert("data.prepare_workers", prepare_workers, _WORKERS | None)
         self.shuffle_block: int | None = convert("data.shuffle_block", shuffle_block, _COUNT | None)
         self.native: bool = convert("data.native", native, bool)
@@ -148,7 +152,7 @@ class DepthDataModule(LightningDataModule):
                 f"data.split={self.split.kind}: all pairs are test, none train or validate. Pass another data.split."
             )
         rank, world_size = self._shard()
-        dataset = StoreDataset(self.store, self.split.train, teacher=self.teacher)
+        dataset = self._training_pairs()
         # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees the same order.
         if self.shuffle_block is None:
             return self._loader(dataset, DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed))
@@ -157,6 +161,12 @@ class DepthDataModule(LightningDataModule):
             read_ahead=self.store.read_ahead,
         )  # fmt: skip
         return self._loader(dataset, sampler)
+
+    def _training_pairs(self) -> StoreDataset:
+        pairs = StoreDataset(self.store, self.split.train, teacher=self.teacher)
+        device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
+        wanted = device.type == "cuda" if self.on_device == "auto" else self.on_device == "true"
+        return on_device(pairs, device) if wanted and pairs.teacher is None else pairs
 
     def val_dataloader(self) -> DataLoader[RawBatch]:
         """Validation batches, in the store's order."""
@@ -210,14 +220,15 @@ class DepthDataModule(LightningDataModule):
         return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size))
 
     def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
+        there = isinstance(dataset, DeviceDataset)
         return LateLoader(
             dataset,
             self.batch_size,
             sampler=sampler,
-            num_workers=self.num_workers,
+            num_workers=0 if there else self.num_workers,
             collate_fn=as_is,
-            pin_memory=torch.cuda.is_available(),
-            persistent_workers=self.num_workers > 0,
+            pin_memory=torch.cuda.is_available() and not there,
+            persistent_workers=self.num_workers > 0 and not there,
         )
 
     def _shard(self) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -9,9 +10,13 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from hudepth.base.console import log
 from hudepth.base.types import RawBatch
 from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
+
+_AT_ONCE = 256
+"""Pairs that are copied to a device in one go."""
 
 
 class StoreDataset(Dataset[RawBatch]):
@@ -46,6 +51,47 @@ class StoreDataset(Dataset[RawBatch]):
         if self.teacher is not None:
             batch["teacher_m"] = torch.from_numpy(self.teacher.read(rows))
         return batch
+
+
+class DeviceDataset(StoreDataset):
+    """Pairs of another data set that lie in a device's memory as bytes: nothing is copied there while training.
+
+    Raises torch.OutOfMemoryError if they do not fit.
+    """
+
+    def __init__(self, pairs: StoreDataset, device: torch.device) -> None:
+        super().__init__(pairs.store, pairs.indices)
+        height, width = self.store.size
+        self._image = torch.empty((len(self), height, width, 3), dtype=torch.uint8, device=device)
+        self._depth = torch.empty((len(self), height, width), dtype=torch.int16, device=device)
+        self._rows = torch.tensor(self.indices, device=device)
+        for start in range(0, len(self), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            image, depth = map(torch.from_numpy, self.store.read(self.indices[part]))
+            self._image[part] = image
+            self._depth[part] = depth.view(torch.int16)  # few operations take unsigned numbers
+
+    def __getitems__(self, positions: Sequence[int]) -> RawBatch:
+        """Return the batch at these positions, gathered on the device."""
+        places = torch.tensor(positions).to(self._rows.device, non_blocking=True)
+        image, depth, rows = (x.index_select(0, places) for x in (self._image, self._depth, self._rows))
+        return RawBatch(image=image, stored_depth=depth.view(torch.uint16), index=rows, per_m=self.store.per_m)
+
+
+def on_device(pairs: StoreDataset, device: torch.device) -> StoreDataset:
+    """Return the pairs in a device's memory if they take less than half of what is free there, else as they are."""
+    needed = len(pairs) * math.prod(pairs.store.size) * 5  # 3 bytes of image, 2 of depth
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else math.inf
+    try:
+        if needed < free / 2:
+            return DeviceDataset(pairs, device)
+    except torch.OutOfMemoryError:  # somebody else took it meanwhile
+        pass
+    log.info(
+        "data.on_device: the training pairs take %.1f GB, and %.1f GB are free on %s; they are read from the disk",
+        needed / 1e9, free / 1e9, device,
+    )  # fmt: skip
+    return pairs
 
 
 class LateLoader(DataLoader[RawBatch]):

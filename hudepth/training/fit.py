@@ -15,7 +15,7 @@ from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
 from hudepth.base.instantiate import has_target, import_trusted, instantiate
-from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision
+from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision, uses_cuda
 from hudepth.base.options import parse
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
@@ -45,6 +45,8 @@ def fit(training: Training) -> float | None:
     data = build_datamodule(training)
     net = build_network(config["model"], trust=options.trust)
     arithmetic = resolve_precision(options.trainer.precision, options.trainer.accelerator)
+    if uses_cuda(options.trainer.accelerator):
+        torch.set_num_threads(1)  # more of them delay the one that launches the GPU's work
     net.to(memory_format=memory_format(options.memory_format, arithmetic))  # type: ignore[call-overload]
     check_input(net, data.sizes)
     restore_split(training, data)

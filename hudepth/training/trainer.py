@@ -60,6 +60,7 @@ def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Cal
     loggers = [drop_on_failure(logger) for logger in loggers]
     defaults = {
         "enable_model_summary": False, "enable_progress_bar": shows_progress(), "num_sanity_val_steps": 0,
+        "benchmark": not config["trainer"].get("deterministic"),  # cuDNN tries its algorithms: sizes hardly change
         "log_every_n_steps": 1,  # everything is logged per epoch; a larger number only makes Lightning warn
     }  # fmt: skip
     return build_trainer(

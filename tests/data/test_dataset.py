@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
-from hudepth.data.dataset import BlockShuffle, ShardSampler, StoreDataset, as_is
+from hudepth.data import dataset
+from hudepth.data.dataset import BlockShuffle, DeviceDataset, ShardSampler, StoreDataset, as_is, on_device
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter
 
@@ -34,9 +35,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> DepthStore:
 
 
 def test_a_batch_holds_the_rows_asked_for(store: DepthStore) -> None:
-    dataset = StoreDataset(store, [5, 0, 3])
-    assert len(dataset) == 3
-    batch = dataset.__getitems__([2, 0, 2])
+    pairs = StoreDataset(store, [5, 0, 3])
+    assert len(pairs) == 3
+    batch = pairs.__getitems__([2, 0, 2])
     images, depths = store.read([3, 5, 3])
     assert sorted(batch) == ["image", "index", "per_m", "stored_depth"]
     assert (batch["image"].dtype, batch["stored_depth"].dtype) == (torch.uint8, torch.uint16)
@@ -81,9 +82,9 @@ def test_shards_partition_exactly(length: int, world_size: int) -> None:
 
 
 def test_the_store_is_found_again_after_pickling(store: DepthStore, tmp_path: Path) -> None:
-    dataset = StoreDataset(store, [1, 2], native=True)
-    before = dataset[0]
-    torch.save(dataset, tmp_path / "dataset")
+    pairs = StoreDataset(store, [1, 2], native=True)
+    before = pairs[0]
+    torch.save(pairs, tmp_path / "dataset")
     after = torch.load(tmp_path / "dataset", weights_only=False)[0]
     assert torch.equal(before["image"], after["image"])
     assert torch.equal(before["native_depth"][0], after["native_depth"][0])
@@ -141,3 +142,34 @@ def test_a_store_takes_hints(store: DepthStore) -> None:
     before = store.read([0, 1])
     store.read_ahead(0, len(store) - 1)
     assert all((a == b).all() for a, b in zip(before, store.read([0, 1]), strict=True))
+
+
+def test_pairs_on_a_device_are_the_same(store: DepthStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "_AT_ONCE", 2)
+    pairs = StoreDataset(store, [5, 0, 3, 1, 4])
+    moved = on_device(pairs, torch.device("cpu"))
+    assert isinstance(moved, DeviceDataset)
+    assert len(moved) == 5
+    for positions in ([4], [2, 0, 2], [0, 1, 2, 3, 4]):
+        found, expected = moved.__getitems__(positions), pairs.__getitems__(positions)
+        assert set(found) == set(expected)
+        for key, value in expected.items():
+            other: Any = found[key]  # type: ignore[literal-required]
+            assert (
+                other.dtype == value.dtype and other.equal(value) if isinstance(value, torch.Tensor) else other == value
+            )
+
+
+@pytest.mark.parametrize("free", [100, 10**12], ids=["too little", "taken meanwhile"])
+def test_pairs_that_do_not_fit_are_read_from_the_disk(
+    store: DepthStore, free: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> None:
+        raise torch.OutOfMemoryError
+
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free, free))
+    monkeypatch.setattr(dataset, "DeviceDataset", full)
+    pairs = StoreDataset(store, [0, 1])
+    with caplog.at_level("INFO"):
+        assert on_device(pairs, torch.device("cuda")) is pairs
+    assert "data.on_device: the training pairs take 0.0 GB" in caplog.text

@@ -118,6 +118,13 @@ def test_history_survives_a_resume(workers: int, data: DepthDataModule, tmp_path
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
+def test_pairs_on_the_device_train_the_same(data: DepthDataModule, tmp_path: Path) -> None:
+    fit(data, tmp_path / "disk", max_epochs=2)
+    data.on_device = "true"
+    fit(data, tmp_path / "device", max_epochs=2)
+    assert (tmp_path / "device" / "metrics.csv").read_bytes() == (tmp_path / "disk" / "metrics.csv").read_bytes()
+
+
 class Dropped(TinyUNet):
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         return super().forward(torch.nn.functional.dropout2d(image, 0.3, self.training))
