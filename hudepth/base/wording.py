@@ -18,11 +18,14 @@ LAUNCHERS = {
 }  # fmt: skip
 """Ways to run the jobs of a sweep, and the extra of this package that installs each."""
 
+_ROOM = {
+    errno.ENOSPC: "Free some space",
+    errno.EDQUOT: "Free some of your quota",
+    errno.EFBIG: "Raise the limit of file sizes (ulimit -f)",
+}
 _FOLDER = "Pass a folder that you can write to."
 _FIXES = {
-    errno.ENOSPC: "Free some space, or pass a folder on another disk.",
-    errno.EDQUOT: "Free some of your quota, or pass a folder on another disk.",
-    errno.EFBIG: "Raise the limit of file sizes (ulimit -f), or pass a folder on another disk.",
+    **{code: f"{fix}, or pass a folder on another disk." for code, fix in _ROOM.items()},
     errno.EROFS: _FOLDER, errno.EACCES: _FOLDER, errno.EPERM: _FOLDER, errno.ENOTDIR: _FOLDER,
     errno.EIO: "Check the disk.",
     errno.EISDIR: "Remove the folder of that name, or pass another.",
@@ -50,6 +53,11 @@ def one_line(error: BaseException, task: str) -> str:
             return line
     message = " ".join(str(error).split()) or type(error).__name__
     return f"{type(error).__name__}: {message} (debug=true shows the traceback)"
+
+
+def more_room(error: OSError) -> str:
+    """Return how to get room for what could not be written."""
+    return _ROOM.get(error.errno or 0, _ROOM[errno.ENOSPC])
 
 
 def unwritten(error: OSError) -> str:

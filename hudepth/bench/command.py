@@ -11,6 +11,7 @@ import torch
 
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError
+from hudepth.base.wording import more_room
 from hudepth.bench.contenders import Contenders
 from hudepth.bench.plan import Plan, make_plan
 from hudepth.bench.report import Measured, write_report
@@ -30,7 +31,7 @@ def bench(config: dict[str, Any]) -> None:
         write_report(measured)
     except OSError as error:
         raise ConfigError(
-            f"output: cannot write to '{plan.output}' ({error.strerror or error}). Free some space."
+            f"output: cannot write to '{plan.output}' ({error.strerror or error}). {more_room(error)}."
         ) from error
 
 

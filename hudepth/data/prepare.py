@@ -21,6 +21,7 @@ from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import written_whole
 from hudepth.base.machine import largest_file
 from hudepth.base.options import Range, convert, parse
+from hudepth.base.wording import more_room
 from hudepth.data.pairs import PreparedPair, prepare_pairs, read_metres, values_per_metre
 from hudepth.data.sources.base import Record, Source
 from hudepth.data.sources.contents import hash_contents
@@ -85,7 +86,7 @@ def build_once(path: Path, build: Callable[[Path], None]) -> None:
     except OSError as error:
         raise DataError(
             f"paths.cache: cannot write '{path}' ({error.strerror or error}). "
-            "Free some space, or pass paths.cache=<a folder you can write to>."
+            f"{more_room(error)}, or pass paths.cache=<a folder you can write to>."
         ) from error
 
 

@@ -18,6 +18,7 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.files import output_folder, write_json
 from hudepth.base.machine import usable_cores
 from hudepth.base.options import Choice, Range, Size, parse
+from hudepth.base.wording import more_room
 from hudepth.export.bundle import halve, write_bundle, zip_folder
 from hudepth.export.card import model_card
 from hudepth.export.comparison_images import ComparisonImages, find_images
@@ -124,7 +125,7 @@ def export(config: dict[str, Any]) -> None:
                 record[name] = MAKERS[name](work)
     except OSError as error:
         reason = error.strerror or error
-        raise ConfigError(f"output: cannot write to '{output}' ({reason}). Free some space.") from error
+        raise ConfigError(f"output: cannot write to '{output}' ({reason}). {more_room(error)}.") from error
     finally:
         if record:
             write_json(output / "export.json", {"images": images.origin, **record})

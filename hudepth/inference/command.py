@@ -18,6 +18,7 @@ from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import output_folder, write_json
 from hudepth.base.machine import usable_cores
 from hudepth.base.options import Choice, Range, parse
+from hudepth.base.wording import more_room
 from hudepth.inference.depth_files import FORMATS, Style, write_depth
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.inputs import Item, find_inputs
@@ -88,7 +89,7 @@ def predict(config: dict[str, Any]) -> None:
         if inputs.camera is not None:
             _predict_frames(job, inputs.camera, output / f"camera{inputs.camera}", CAMERA_FORMATS)
     except OSError as error:
-        rest = f"{job.tally.done} were predicted. Free some space or pass another output=<folder>."
+        rest = f"{job.tally.done} were predicted. {more_room(error)}, or pass another output=<folder>."
         raise ConfigError(f"output: cannot write to '{output}' ({error.strerror or error}); {rest}") from error
     finally:
         _report(job, seconds=time.monotonic() - start)

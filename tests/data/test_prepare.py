@@ -379,7 +379,7 @@ def test_a_limit_of_file_sizes_is_refused_at_once(root: Path, cache: Path, monke
     resource = pytest.importorskip("resource")
     source = write_set(root)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, 1024))
-    with pytest.raises(DataError, match=r"ulimit -f"):
+    with pytest.raises(DataError, match=r"\. Raise the limit of file sizes \(ulimit -f\), or pass paths\.cache="):
         prepare(source, size=SIZE, cache=cache)
     assert not [path for path in cache.iterdir() if path.suffix != ".lock"]
 

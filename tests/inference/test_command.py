@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -209,14 +210,20 @@ def test_mistakes_are_one_line(
     assert re.match(f"hudepth-predict: {words}", done.err.splitlines()[-1])
 
 
-def test_a_disk_that_fills_up(tiny: Path, photos: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("code", "fix"), [(errno.ENOSPC, "Free some space"), (errno.EFBIG, "Raise the limit of file sizes (ulimit -f)")]
+)
+def test_a_disk_that_fills_up(
+    code: int, fix: str, tiny: Path, photos: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+        raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr("hudepth.inference.command.write_depth", full)
     done = command("predict", f"checkpoint={tiny}", "input=photos", "output=out")
     assert done.code == 1
-    assert "hudepth-predict: output: cannot write to 'out' (No space left on device); 0 were predicted." in done.err
+    line = f"hudepth-predict: output: cannot write to 'out' ({os.strerror(code)}); 0 were predicted. {fix}, or pass"
+    assert line in done.err
 
 
 def test_what_predict_sees_is_what_test_sees(tiny: Path) -> None:
