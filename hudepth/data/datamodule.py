@@ -87,7 +87,8 @@ class DepthDataModule(LightningDataModule):
         split = convert("data.split", split, str)
         fractions = convert("data.fractions", fractions, list[float])
         check_split(split, fractions)
-        self.source, self.augment, self.teacher_folder = source, augment, teacher
+        self.source, self.augment = source, augment
+        self.teacher_folder: Path | None = convert("distill.teacher", teacher, Path | None)
         self.split_kind, self.fractions = split, tuple(fractions)
         self.size: tuple[int, int] = convert("data.size", size, TrainSize)
         self.stages = read_stages(progressive or [], size=self.size)
@@ -105,6 +106,7 @@ class DepthDataModule(LightningDataModule):
         self.cache: Path = convert("data.cache", cache, Path)
         if self.on_error == "skip":
             source.unpaired = []
+        self._told = False
         self._draws: tuple[int, torch.Generator] | None = None
 
     @cached_property
@@ -126,11 +128,12 @@ class DepthDataModule(LightningDataModule):
         return None if folder is None else TeacherDepths(folder, self.store, self.split.train)
 
     def prepare_data(self) -> None:
-        """Build the depth store and read the teacher's depths; warn if most depths are clipped."""
+        """Build the depth store and read the teacher's depths; the first time, warn if most depths are clipped."""
         _ = self.store, self.teacher
         beyond, text = self._clipped()
-        if beyond > 0.01:
+        if beyond > 0.01 and not self._told:
             log.log(logging.WARNING if beyond > 0.5 else logging.INFO, text)
+        self._told = True
 
     def _clipped(self) -> tuple[float, str]:
         """Return the share of measured pixels beyond the maximum depth, and a line about it."""

@@ -329,6 +329,7 @@ def test_outdoor_depth_and_what_is_clipped(
     data = DepthDataModule(source, size=8, max_depth_m=max_depth_m, cache=tmp_path / "c", fractions=(0.5, 0.25, 0.25))
     with caplog.at_level("INFO"):
         data.prepare_data()
+        data.prepare_data()  # as Lightning does for the training and for its test
     said = [record for record in caplog.records if "data.max_depth_m" in record.message]
     assert [record.levelname for record in said] == ([level] if level else [])
     assert all(share in record.message for record in said)

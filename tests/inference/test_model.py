@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -90,3 +93,12 @@ def test_pillow_images_of_any_mode_are_read_as_their_files_are(grey: DepthModel)
     assert grey.predict(clear).image[0, 0].tolist() == [255, 255, 255]
     with pytest.raises(DataError, match="floating-point"):
         grey.predict(Image.fromarray(np.full((48, 64), 0.5, np.float32)))
+
+
+@pytest.mark.parametrize("trust", ["pt2", ("pt2",), {"pt2"}, iter(["pt2"])])
+def test_what_is_trusted_is_one_name_or_several(trust: Iterable[str], tmp_path: Path) -> None:
+    (tmp_path / "x.pt2").write_bytes(b"no program")
+    with pytest.raises(CheckpointError, match=r"trust=\[pt2\]"):
+        hudepth.load(tmp_path / "x.pt2")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        hudepth.load(tmp_path / "x.pt2", trust=trust)

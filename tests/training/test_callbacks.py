@@ -424,3 +424,14 @@ def test_best_is_remembered_over_a_resume(data: DepthDataModule, tmp_path: Path)
     fit(data, tmp_path, [Scores((0.1, 0.3, 0.2))], max_epochs=3, resume=True)
     assert read_plain(tmp_path / "checkpoints" / "best.ckpt")["epoch"] == 0
     assert {file.name for file in (tmp_path / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
+
+
+def test_scores_are_restored_and_paths_are_those_of_the_run_now(data: DepthDataModule, tmp_path: Path) -> None:
+    fit(data, tmp_path / "before", [Scores((0.1, 0.3))], max_epochs=2)
+    callbacks = read_plain(tmp_path / "before" / "checkpoints" / "last.ckpt")["callbacks"]
+    (state,) = (state for name, state in callbacks.items() if "val/abs_rel" in name)
+    best = checkpoint_callbacks(tmp_path / "after", monitor="val/abs_rel", mode="min")[0]
+    best.load_state_dict(state)
+    scores = best.state_dict()["current_score"], best.state_dict()["best_model_score"]
+    assert [score.item() for score in scores] == pytest.approx([0.1, 0.1])
+    assert best.best_model_path == str(tmp_path / "after" / "checkpoints" / "best.ckpt")
