@@ -210,18 +210,24 @@ class DepthStore:
         """
         images = np.empty((len(indices), *self.size, 3), np.uint8)
         depths = np.empty((len(indices), *self.size), np.uint16)
-        try:
+        with self._damage():
             rows = self._rows.get(self.path)
             for name, target in (("image", images), ("depth", depths)):
                 for place, index in enumerate(indices):
                     rows.read(name, index, target[place])
-        except (OSError, RuntimeError, ValueError) as error:
-            raise DataError(f"'{self.path}' is damaged ({error}). {_AGAIN}") from error
         return images, depths
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError, ValueError, OverflowError) as error:
+            raise DataError(f"'{self.path}' is damaged ({error}). {_AGAIN}") from error
 
     def read_ahead(self, first: int, last: int) -> None:
         """Ask the system to read the pairs from ``first`` to ``last`` in one go, if it takes such hints."""
-        self._rows.get(self.path).read_ahead(first, last)
+        with self._damage():
+            self._rows.get(self.path).read_ahead(first, last)
 
     def read_native(self, index: int) -> NDArray[np.float32]:
         """Read one ground truth at its native resolution: [H, W] metres, 0 where unmeasured.
@@ -233,10 +239,12 @@ class DepthStore:
                 f"'{self.path}' has no native-resolution ground truth, which this protocol needs. "
                 "Pass data.native=true, or protocol=paper."
             )
-        file = self._handle.get(self.path)
-        ends = file["native/end"]
-        start = int(ends[index - 1]) if index else 0
-        stored = cv2.imdecode(file["native/png"][start : int(ends[index])], cv2.IMREAD_UNCHANGED)
+        with self._damage():
+            file = self._handle.get(self.path)
+            ends = file["native/end"]
+            start = int(ends[index - 1]) if index else 0
+            png = file["native/png"][start : int(ends[index])]
+        stored = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
         if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
             raise DataError(f"'{self.path}': the ground truth of '{self.records[index].id}' is damaged. {_AGAIN}")
         return stored.astype(np.float32) / np.float32(self.per_m)

@@ -311,6 +311,20 @@ def test_parts_that_disagree(filled: tuple[Any, ...], damage: Any, what: str) ->
         DepthStore(path)
 
 
+@pytest.mark.parametrize("kind", [{"chunks": None}, {"chunks": (2, *SIZE)}, {"compression": "gzip"}, {"dtype": ">u2"}])
+def test_rows_that_are_stored_in_another_way(filled: tuple[Any, ...], kind: dict[str, Any]) -> None:
+    """The bytes of a foreign file must not be taken for values."""
+    path = filled[0].path
+    with h5py.File(path, "r+") as file:
+        values = file["depth"][()]
+        del file["depth"]
+        file.create_dataset("depth", data=values, **{"chunks": (1, *SIZE), **kind})
+    store = DepthStore(path)
+    for use in (lambda: store.read([0]), lambda: store.read_ahead(0, 3)):
+        with pytest.raises(DataError, match=r"is damaged \('/depth' is not stored row by row\)\. Delete it"):
+            use()
+
+
 @pytest.mark.parametrize("content", [b"x" * 40, png(np.ones((2, 2, 3), np.uint8)), png(np.ones((2, 2), np.uint8))])
 def test_native_truth_that_is_no_16_bit_png(filled: tuple[Any, ...], content: np.ndarray) -> None:
     store = filled[0]

@@ -82,7 +82,8 @@ def _row_starts(array: h5py.Dataset) -> NDArray[np.int64]:
         if chunk.filter_mask == 0 and chunk.size == array.dtype.itemsize * np.prod(array.shape[1:], dtype=np.int64):
             starts[chunk.chunk_offset[0]] = chunk.byte_offset
 
-    if array.chunks == (1, *array.shape[1:]) and array.id.get_create_plist().get_nfilters() == 0:
+    plain = array.dtype.isnative and array.id.get_create_plist().get_nfilters() == 0
+    if plain and array.chunks == (1, *array.shape[1:]):
         array.id.chunk_iter(note)
     if (starts < 0).any():
         raise ValueError(f"'{array.name}' is not stored row by row")
