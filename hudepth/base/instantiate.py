@@ -9,21 +9,27 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, cast
 
 from hudepth.base.errors import ConfigError, HudepthError, did_you_mean
+from hudepth.base.options import convert
 
 TRUSTED = (
     "hudepth.", "torch.nn.modules.loss.", "torch.optim.", "lightning.pytorch.loggers.", "lightning.pytorch.callbacks.",
 )  # fmt: skip
 """Prefixes of modules whose classes a configuration may name: of torch.nn only losses, since nn.LSTM(num_layers=10**8)
 would never be built."""
+_NUMBER = {"bool", "int", "float", "None", "Optional", "Union", "typing", "Tensor", "torch"}
+"""Words of the annotation of an argument that is a number or a switch."""
 _IMPORTED = ("torch.nn.",)
 """Prefixes under which classes of :data:`TRUSTED` are usually named: torch.nn.L1Loss."""
 
 
-def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type = object, **extra: Any) -> Any:
+def instantiate(
+    config: Any, *args: Any, trust: Iterable[str] = (), only: type = object, key: str = "", **extra: Any
+) -> Any:
     """Build what ``config`` describes.
 
     Args:
@@ -32,12 +38,31 @@ def instantiate(config: Any, *args: Any, trust: Iterable[str] = (), only: type =
         trust: further modules whose classes may be named, for example ``["my_package"]``.
         only: every class named, also a nested one, must be of this kind: what an untrusted configuration builds where
             a network is expected should not be something that writes files.
+        key: names the outermost object in errors about its numbers: ``optim``.
         **extra: keyword arguments of the outermost object, over those in ``config``.
 
     Raises:
         ConfigError: if a target is not trusted, is no such class, or does not take its arguments.
     """
-    return _build(config, _prefixes(trust), only, args, extra)
+    prefixes = _prefixes(trust)
+    if key and has_target(config):
+        _check_numbers(_locate(str(config["_target_"]), prefixes), config, key)
+    return _build(config, prefixes, only, args, extra)
+
+
+def _check_numbers(target: type, config: Mapping[str, Any], key: str) -> None:
+    """Check what a class says are numbers or switches: PyTorch's often notice other values in the first step only."""
+    try:
+        parameters = inspect.signature(target).parameters
+    except ValueError:  # a class of C code
+        return
+    for name in parameters.keys() & config.keys():
+        # As text, since it may name what its module did not import.
+        words = set(re.findall(r"\w+", inspect.formatannotation(parameters[name].annotation)))
+        kind = next((each for each in (float, int, bool) if each.__name__ in words), None)
+        left_out = config[name] is None and words & {"None", "Optional"}
+        if kind and words <= _NUMBER and not left_out:
+            convert(f"{key}.{name}", config[name], kind)
 
 
 def find_class(target: str, *, trust: Iterable[str] = ()) -> type:

@@ -22,5 +22,5 @@ def build_network(model: Mapping[str, Any], *, trust: Sequence[str] = ()) -> nn.
     target = str(model.get("_target_"))
     if not trust and not find_class(target).__module__.startswith(f"{OWN}."):
         raise ConfigError(f"model: '{target}' is no depth network of hudepth. Pass trust=[<package>] to build others.")
-    net: nn.Module = instantiate(dict(model), trust=trust, only=object if trust else nn.Module)
+    net: nn.Module = instantiate(dict(model), trust=trust, only=object if trust else nn.Module, key="model")
     return net

@@ -127,19 +127,19 @@ def build_module(
     """
     distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
 
-    def build(part: Mapping[str, Any], kind: type, argument: Any, own: type, **extra: Any) -> Any:
+    def build(key: str, part: Mapping[str, Any], kind: type, argument: Any, own: type, **extra: Any) -> Any:
         """Build an optimiser or a schedule; only those of hudepth, from the module of ``own``, take ``extra``."""
         extra = extra if str(part["_target_"]).startswith(f"{own.__module__}.") else {}
-        return instantiate(part, argument, trust=trust, only=kind, **extra)
+        return instantiate(part, argument, trust=trust, only=kind, key=key, **extra)
 
     def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> Any:
         optim = dict(config["optim"])
         if optim.get("fused", False) is None:  # Lightning cannot clip gradients that a fused update unscales
             optim["fused"] = config["trainer"]["precision"] != "16-mixed"
-        return build(optim, Optimizer, parameters, GroupedAdamW, encoder=find_encoder(net))
+        return build("optim", optim, Optimizer, parameters, GroupedAdamW, encoder=find_encoder(net))
 
     def schedule(optimizer: Optimizer, total_steps: int) -> Any:
-        return build(config["schedule"], LRScheduler, optimizer, StepSchedule, total_steps=total_steps)
+        return build("schedule", config["schedule"], LRScheduler, optimizer, StepSchedule, total_steps=total_steps)
 
     info = datamodule.store.info
     data = {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")}

@@ -36,7 +36,7 @@ class GroupedAdamW(AdamW):
 
     ``encoder_lr_factor`` is the encoder's learning rate over ``lr``, finite and not negative, else a ConfigError is
     raised; 0 leaves the encoder unchanged. ``weight_decay`` applies to matrices and kernels. ``options`` are further
-    arguments of :class:`torch.optim.AdamW`, for example ``fused``.
+    arguments of :class:`torch.optim.AdamW`, as ``fused`` is.
     """
 
     def __init__(
@@ -47,6 +47,7 @@ class GroupedAdamW(AdamW):
         encoder: nn.Module | None = None,
         encoder_lr_factor: float = 1.0,
         weight_decay: float = 0.01,
+        fused: bool | None = None,
         **options: Any,
     ) -> None:
         if not (math.isfinite(encoder_lr_factor) and encoder_lr_factor >= 0):
@@ -61,4 +62,4 @@ class GroupedAdamW(AdamW):
             rate = lr * (encoder_lr_factor if name.startswith("encoder") else 1.0)
             decay = 0.0 if name.endswith("_no_decay") else weight_decay
             described.append({"params": members, "name": name, "lr": rate, "weight_decay": decay})
-        super().__init__(described, lr=lr, **options)
+        super().__init__(described, lr=lr, fused=fused, **options)

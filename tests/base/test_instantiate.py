@@ -267,3 +267,29 @@ def test_losses_of_torch_need_none() -> None:
 
 def test_sizes_that_torch_refuses() -> None:
     assert "TinyUNet" in refused({"_target_": "hudepth.models.TinyUNet", "channels": -1})
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "value", "what"),
+    [
+        ("torch.optim.AdamW", "lr", "abc", "a number"),
+        ("torch.optim.AdamW", "weight_decay", [{"a": 1}], "a number"),
+        ("torch.optim.SGD", "nesterov", "abc", "true or false"),
+        ("torch.optim.lr_scheduler.StepLR", "step_size", 2.5, "a whole number"),
+        ("torch.optim.lr_scheduler.CosineAnnealingLR", "eta_min", "abc", "a number"),
+        ("hudepth.training.optim.GroupedAdamW", "fused", "abc", "true or false"),
+        ("hudepth.models.tiny.TinyUNet", "channels", [{"a": 1}], "a whole number"),
+    ],
+)
+def test_numbers_of_another_type(target: str, name: str, value: object, what: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^part\.{name}: .* is not {what}\.$"):
+        instantiate({"_target_": target, name: value}, [], key="part")
+
+
+def test_arguments_that_are_more_than_numbers_are_left_to_the_class() -> None:
+    weights, schedulers = [nn.Parameter(torch.zeros(1))], torch.optim.lr_scheduler
+    adam = {"_target_": "torch.optim.Adam", "lr": 1, "betas": [0.5, 0.9], "fused": None}
+    assert instantiate(adam, weights, key="optim").defaults["betas"] == (0.5, 0.9)
+    cycle = {"_target_": "torch.optim.lr_scheduler.OneCycleLR", "max_lr": [0.1], "total_steps": 3}
+    built = instantiate(cycle, torch.optim.SGD(weights), key="schedule", anneal_strategy="linear")
+    assert isinstance(built, schedulers.OneCycleLR)
