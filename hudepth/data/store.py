@@ -189,7 +189,7 @@ class DepthStore:
             with h5py.File(self.path, "r") as file:
                 if (file.attrs.get("format"), file.attrs.get("version")) != (FORMAT, VERSION):
                     raise DataError(f"'{self.path}' is not a depth store of version {VERSION}. {_AGAIN}")
-                self.info: dict[str, Any] = json.loads(file.attrs["info"])
+                self.info: dict[str, Any] = dict(json.loads(file.attrs["info"]))
                 self.per_m = int(file.attrs.get("per_metre", MM_PER_M))  # stored depths are so many to the metre
                 self.records, self.size, self.has_native = _read_layout(file)
             if self.per_m not in (MM_PER_M, OUTDOOR_PER_M):

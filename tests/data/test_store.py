@@ -300,6 +300,7 @@ def _text(*values: str) -> Callable[[np.ndarray], np.ndarray]:
         (_replace("records/frame", lambda values: values + 0.5), "'records/frame' is float64"),
         (lambda file: file.attrs.__setitem__("per_metre", 7), "per_metre is 7"),
         (lambda file: file.attrs.__setitem__("info", "[" * 20_000), "recursion"),
+        (lambda file: file.attrs.__setitem__("info", "[1]"), "cannot convert"),
         (lambda file: (file.pop("image"), file.__setitem__("image", h5py.ExternalLink("b.h5", "image"))), "no array"),
     ],
 )
