@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import ClassVar
+from unicodedata import normalize
 
 from hudepth.base.errors import DataError
 from hudepth.base.images import read_bytes
@@ -121,8 +122,8 @@ class ManifestSource(FileSource):
             frame=int(frame),
             split=split,
             category=row.get("category", ""),
-            image=row["image"],
-            depth=row["depth"],
+            image=_on_disk(folder, row["image"]),
+            depth=_on_disk(folder, row["depth"]),
             depth_scale_m=scale_m,
             depth_offset=_number(row, "depth_offset", where) or 0.0,
         )
@@ -145,6 +146,12 @@ class NyuLabeledSource(Nyu, ManifestSource):
 
     def _row_id(self, row: Mapping[str, str]) -> str:
         return super()._row_id(row).zfill(5)
+
+
+def _on_disk(folder: Path, name: str) -> str:
+    """Return a name with its accents as the file has them: Macs write them as letters of their own."""
+    forms = () if name.isascii() else (name, normalize("NFC", name), normalize("NFD", name))
+    return next((form for form in forms if (folder / form).exists()), name)
 
 
 def _number(row: Mapping[str, str], column: str, where: str) -> float | None:

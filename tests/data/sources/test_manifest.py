@@ -6,6 +6,7 @@ import csv
 import pickle
 from collections import Counter
 from pathlib import Path
+from unicodedata import normalize
 
 import cv2
 import numpy as np
@@ -272,3 +273,16 @@ def test_a_list_outside_the_folder_is_not_read(tmp_path: Path, name: str) -> Non
     with pytest.raises(DataError, match=r"data\.source\.manifest") as caught:
         ManifestSource(tmp_path / "set", manifest=name).records()
     assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("listed", "stored"), [("NFC", "NFD"), ("NFD", "NFC"), ("NFC", "NFC"), ("NFD", "NFD")])
+def test_accents_are_one_letter_or_two(tmp_path: Path, listed: str, stored: str) -> None:
+    name = "Küche é"
+    assert cv2.imwrite(str(tmp_path / f"{normalize(stored, name)}.jpg"), RGB)
+    assert cv2.imwrite(str(tmp_path / f"{normalize(stored, name)}.png"), DEPTH)
+    write_list(tmp_path, "image,depth", f"{normalize(listed, name)}.jpg,{normalize(listed, name)}.png")
+    source = ManifestSource(tmp_path, encoding="uint16_mm")
+    (record,) = source.records()
+    assert record.id == normalize(listed, name)
+    np.testing.assert_array_equal(source.read(record).depth, DEPTH)
+    assert all(file.is_file() for file in source.files())
