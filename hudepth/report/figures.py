@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,7 +41,8 @@ def draw_figures(options: FiguresOptions) -> None:
         raise ConfigError(f"run: '{run}' is not a run directory. Pass run=<runs/name/date_time>, or run=last.")
     history = read_history(run / "metrics.csv")
     output = output_folder(options.output or run / "figures", within=None if options.output else run)
-    save_figure(output / "curves.png", draw_curves(history, title=f"{run.parent.name}: loss and raw terms"))
+    name = os.fsencode(run.parent.name).decode(errors="backslashreplace")
+    save_figure(output / "curves.png", draw_curves(history, title=f"{name}: loss and raw terms"))
     log.info("total loss and its terms by epoch: %s", (output / "curves.png").resolve())
     if not options.panels:
         return

@@ -72,7 +72,8 @@ def write_resumed(run: Path, *, config: Mapping[str, Any], overrides: Sequence[s
 
 def _write_config(run: Path, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
     write_text(run / "config.yaml", yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
-    write_text(run / "overrides.txt", "".join(f"{line}\n" for line in overrides))
+    lines = "".join(f"{line}\n" for line in overrides)  # of which paths may hold bytes that are not UTF-8
+    write_text(run / "overrides.txt", lines.encode(errors="backslashreplace").decode())
 
 
 class _LogFile(logging.FileHandler):

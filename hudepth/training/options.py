@@ -13,6 +13,7 @@ from hudepth.base.devices import check_devices
 from hudepth.base.errors import ConfigError
 from hudepth.base.machine import Arithmetic
 from hudepth.base.options import Range, parse
+from hudepth.data.sources.pairing import printable
 
 MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
 
@@ -101,8 +102,18 @@ class TrainOptions:
 
 def parse_options(config: Mapping[str, Any]) -> TrainOptions:
     """Check the options of a configuration; raise ConfigError for wrong types or ranges, and for missing devices."""
+    _check_text("", config)
     options = parse(TrainOptions, config)
     if options.compile and config["model"].get("recompute"):
         raise ConfigError("compile: torch.compile does not support model.recompute. Set one of them to false.")
     check_devices(config["trainer"])
     return options
+
+
+def _check_text(key: str, value: Any) -> None:
+    """Refuse a path that is not UTF-8: a run's config.yaml could not hold it, so the run could not resume."""
+    if isinstance(value, Mapping):
+        for name, each in value.items():
+            _check_text(f"{key}.{name}".lstrip("."), each)
+    elif isinstance(value, str) and printable(value) != value:
+        raise ConfigError(f"{key}: '{printable(value)}' is not UTF-8. Pass a link to it with a name that is.")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -69,6 +70,11 @@ def test_start_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("a file")
     with pytest.raises(ConfigError, match=r"/run' .*File exists.* Pass paths.runs="):
         run_dir.write_start(tmp_path / "run", config={}, overrides=[], environment={})
+
+
+def test_overrides_that_are_not_utf_8_are_escaped(tmp_path: Path) -> None:
+    run_dir.write_start(tmp_path, config={}, overrides=["resume=" + os.fsdecode(b"K\xfcche")], environment={})
+    assert (tmp_path / "overrides.txt").read_text(encoding="utf-8") == "resume=K\\udcfcche\n"
 
 
 def test_a_resumed_run_keeps_its_first_overrides(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import pytest
@@ -59,3 +60,10 @@ def test_what_cannot_be_combined(config: dict[str, Any]) -> None:
 
 def test_one_trusted_package_is_a_list(config: dict[str, Any]) -> None:
     assert parse_options({**config, "trust": "my_package"}).trust == ["my_package"]
+
+
+def test_a_path_that_a_run_could_not_record(config: dict[str, Any]) -> None:
+    root = os.fsdecode(b"K\xfcche")
+    with pytest.raises(ConfigError, match=r"^data\.root: 'K.*che' is not UTF-8\. Pass a link") as caught:
+        parse_options({**config, "data": {"root": root}})
+    str(caught.value).encode()
