@@ -32,7 +32,7 @@ _WORD = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_][\w./-]{0,99}", re.I
 
 def _main(task: str) -> int:
     """Run one task with the arguments of this process; return its exit code."""
-    # Threads that wait for each other soon sleep: by default they spin for milliseconds, and prediction beside one other
+    # Threads that wait for each other soon sleep. By default they spin for milliseconds, and prediction beside another
     # busy program drops to a tenth (experiments/speed/busy_machine.py). OpenMP reads this when torch is imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     arguments = sys.argv[1:]
