@@ -41,6 +41,8 @@ SUFFIXES = (
 )  # fmt: skip
 """Extensions that are looked for in folders, in lower case."""
 
+MAX_NATIVE_PIXELS = 25_000_000
+"""Of a ground truth that is scored, which takes some 50 bytes a pixel. The largest public ones have 24 million."""
 MAX_PIXELS = 100_000_000
 """Larger images are refused before they are decoded."""
 _ORIENTATION = 0x0112  # a tag of EXIF

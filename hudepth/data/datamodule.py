@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from hudepth.base.console import log
 from hudepth.base.errors import DataError
+from hudepth.base.images import MAX_NATIVE_PIXELS
 from hudepth.base.options import Choice, Range, TrainSize, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
@@ -223,10 +224,12 @@ class DepthDataModule(LightningDataModule):
         return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size))
 
     def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
+        largest = max((h * w for h, w in self.store.info.get("native_sizes") or []), default=1)
+        fit = max(1, MAX_NATIVE_PIXELS // largest) if dataset.native else self.batch_size
         there = isinstance(dataset, DeviceDataset)
         return LateLoader(
             dataset,
-            self.batch_size,
+            min(self.batch_size, fit),
             sampler=sampler,
             num_workers=0 if there else self.num_workers,
             collate_fn=as_is,

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.images import MAX_NATIVE_PIXELS
 from hudepth.base.options import TrainSize, convert
 from hudepth.data.sources.base import Record
 from hudepth.data.sources.files import PerProcess
@@ -232,19 +233,18 @@ class DepthStore:
     def read_native(self, index: int) -> NDArray[np.float32]:
         """Read one ground truth at its native resolution: [H, W] metres, 0 where unmeasured.
 
-        Raises DataError if the store was prepared without native ground truth.
+        Raises DataError if the store was prepared without native ground truth, or it is too large.
         """
         if not self.has_native:
-            raise DataError(
-                f"'{self.path}' has no native-resolution ground truth, which this protocol needs. "
-                "Pass data.native=true, or protocol=paper."
-            )
+            raise DataError(f"'{self.path}' has no native ground truth. Pass data.native=true, or protocol=paper.")
         with self._damage():
             file = self._handle.get(self.path)
-            ends = file["native/end"]
-            start = int(ends[index - 1]) if index else 0
-            png = file["native/png"][start : int(ends[index])]
+            start, end = [0, *file["native/end"][max(0, index - 1) : index + 1].tolist()][-2:]
+            png = file["native/png"][start:end]
         stored = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+        where = f"'{self.path}': the ground truth of '{self.records[index].id}'"
         if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
-            raise DataError(f"'{self.path}': the ground truth of '{self.records[index].id}' is damaged. {_AGAIN}")
+            raise DataError(f"{where} is damaged. {_AGAIN}")
+        if stored.size > MAX_NATIVE_PIXELS:
+            raise DataError(f"{where} has over {MAX_NATIVE_PIXELS:,} pixels. Shrink it, or pass protocol=paper.")
         return stored.astype(np.float32) / np.float32(self.per_m)

@@ -19,6 +19,7 @@ from hypothesis.extra.numpy import arrays
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.types import Batch, RawBatch
+from hudepth.data import datamodule
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.preprocess import preprocess
 from hudepth.data.sources.base import RawPair, Record, Source
@@ -141,6 +142,13 @@ def test_test_batches_bring_the_native_truth(make: Make) -> None:
         np.testing.assert_array_equal(depth[0].numpy() > 0, truth > 0)
     for loader in (data.train_dataloader(), data.val_dataloader()):
         assert all("native_depth" not in batch for batch in loader)
+
+
+def test_large_native_truths_come_in_smaller_batches(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(datamodule, "MAX_NATIVE_PIXELS", 2 * NATIVE[0] * NATIVE[1])
+    data = make(split="official", batch_size=5)
+    assert [len(raw["index"]) for raw in data.test_dataloader()] == [2, 2, 2]
+    assert len(next(iter(data.train_dataloader()))["index"]) == 5
 
 
 def test_a_store_without_native_truth_gives_none(make: Make) -> None:

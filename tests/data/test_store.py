@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hudepth.base.errors import DataError
+from hudepth.data import store as store_module
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter, to_mm, to_stored
 
@@ -186,10 +187,7 @@ def test_without_native_truth(tmp_path: Path) -> None:
     store = write_store(path, np.zeros((1, *SIZE, 3), np.uint8), np.ones((1, *SIZE), np.uint16))
     with pytest.raises(DataError) as caught:
         store.read_native(0)
-    assert str(caught.value) == (
-        f"'{path}' has no native-resolution ground truth, which this protocol needs. "
-        "Pass data.native=true, or protocol=paper."
-    )
+    assert str(caught.value) == (f"'{path}' has no native ground truth. Pass data.native=true, or protocol=paper.")
 
 
 @pytest.mark.parametrize("native", [True, False])
@@ -324,6 +322,12 @@ def test_rows_that_are_stored_in_another_way(filled: tuple[Any, ...], kind: dict
     for use in (lambda: store.read([0]), lambda: store.read_ahead(0, 3)):
         with pytest.raises(DataError, match=r"is damaged \('/depth' is not stored row by row\)\. Delete it"):
             use()
+
+
+def test_native_truth_that_is_too_large_to_score(filled: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_module, "MAX_NATIVE_PIXELS", filled[0].read_native(2).size - 1)
+    with pytest.raises(DataError, match=r"ground truth of '02' has over \d+ pixels\. Shrink it"):
+        filled[0].read_native(2)
 
 
 @pytest.mark.parametrize("content", [b"x" * 40, png(np.ones((2, 2, 3), np.uint8)), png(np.ones((2, 2), np.uint8))])
