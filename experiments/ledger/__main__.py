@@ -43,7 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for line in (line for run in runs for line in run.problems):
         log.warning("%s", line)
     words = sys.argv[1:] if arguments is None else arguments
-    here = {**environment(seed=0, accelerator="auto"), "command": ["python", "-m", "experiments.ledger", *words]}
+    here = {
+        **environment(seed=0, accelerator="auto", precision="32-true"),
+        "command": ["python", "-m", "experiments.ledger", *words],
+    }
     makers = _makers(runs, batches=batches if options.throughput else [], seconds=seconds, device=str(here["device"]))
     rows = [row for make in track(makers, total=len(makers), what="checking the paper") for row in make()]
     parts: dict[str, Any] = {"table_2": rows_table2.table_2_with_runs(runs), "runs": runs, "environment": here}

@@ -507,7 +507,7 @@ def test_a_file_that_cannot_grow_gives_one_line_and_no_crash(
     assert (process.returncode, out, err) == (
         3,
         f"paths.cache: cannot write '{path}' (File too large). "
-        "Free some space, or pass paths.cache=<a folder you can write to>.\n",
+        "Raise the limit of file sizes (ulimit -f), or pass paths.cache=<a folder you can write to>.\n",
         "",
     )
     assert {file.suffix for file in cache.iterdir()} <= {".lock", ".json"}  # the latter: hashes of older files
