@@ -39,9 +39,8 @@ class EMA(WeightAveraging):
         """Pair the tensors of both networks once: at every step, as Lightning does, it takes longer than averaging."""
         assert self._average_model is not None
         both = [[*net.parameters(), *net.buffers()] for net in (self._average_model.module, pl_module)]
-        self._pairs = [
-            [[x for x in tensors if x.is_floating_point() is kind] for tensors in both] for kind in (True, False)
-        ]
+        kinds = [[[x for x in tensors if x.is_floating_point() is kind] for tensors in both] for kind in (True, False)]
+        self._pairs = [(averaged, current) for averaged, current in kinds if averaged]  # some networks have no counters
 
     @torch.no_grad()
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -52,7 +51,7 @@ class EMA(WeightAveraging):
         for averaged, current in self._pairs:
             if self._average_model.n_averaged == 0:
                 torch._foreach_copy_(averaged, current)
-            elif averaged:
+            else:
                 self._average(averaged, current, self._average_model.n_averaged)
         self._average_model.n_averaged += 1
         self._latest_update_step = trainer.global_step

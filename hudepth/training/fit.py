@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer, seed_everything
 from torch import nn
-from torch.optim import Optimizer
+from torch.optim import Adam, AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
-from hudepth.base.instantiate import has_target, import_trusted, instantiate
+from hudepth.base.instantiate import find_class, has_target, import_trusted, instantiate
 from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision, uses_cuda
 from hudepth.base.options import parse
 from hudepth.data.build import build_data
@@ -134,8 +134,11 @@ def build_module(
 
     def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> Any:
         optim = dict(config["optim"])
-        if optim.get("fused", False) is None:  # Lightning cannot clip gradients that a fused update unscales
-            optim["fused"] = config["trainer"]["precision"] != "16-mixed"
+        if optim.get("fused", False) is None:
+            del optim["fused"]
+            # Others may not take it, and with 16 bits Lightning cannot clip gradients that a fused update unscales.
+            if find_class(optim["_target_"], trust=trust) in (Adam, AdamW, GroupedAdamW):
+                optim["fused"] = not str(config["trainer"]["precision"]).startswith("16")
         return build("optim", optim, Optimizer, parameters, GroupedAdamW, encoder=find_encoder(net))
 
     def schedule(optimizer: Optimizer, total_steps: int) -> Any:

@@ -14,11 +14,13 @@ from hudepth.base.errors import ConfigError
 
 
 def fit_state(optimizer: Optimizer) -> None:
-    """Lay out a restored state as the parameters are: fused updates go through memory without looking.
+    """Lay out the restored state of fused updates as the parameters are: they go through memory without looking.
 
     Raises ValueError if a part has another shape than its parameter.
     """
-    for parameter, state in optimizer.state.items():
+    fused = [x for group in optimizer.param_groups if group.get("fused") for x in group["params"]]
+    for parameter in fused:
+        state = optimizer.state.get(parameter, {})
         for key, value in state.items():
             if not isinstance(value, Tensor) or value.ndim == 0:
                 continue

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -154,6 +155,20 @@ def test_counters_are_copied_and_statistics_averaged() -> None:
     found = dict(model.module.state_dict())
     assert found["num_batches_tracked"].item() == 3
     assert_close(found, average(states, decay=0.5))
+
+
+def test_a_network_without_counters() -> None:
+    ema, net, trainer = EMA(decay=0.5), LightningModule(), Mock(Trainer)
+    net.weight = torch.nn.Parameter(torch.zeros(2, 2))
+    ema._average_model = AveragedModel(net, use_buffers=True)
+    ema.on_train_start(trainer, net)
+    states = []
+    for step in (1, 2, 3):
+        torch.nn.init.normal_(net.get_parameter("weight"))
+        trainer.global_step = step
+        ema.on_train_batch_end(trainer, net)
+        states.append({name: value.clone() for name, value in net.state_dict().items()})
+    assert_close(dict(ema._average_model.module.state_dict()), average(states, decay=0.5))
 
 
 @pytest.mark.parametrize("decay", [1.0, -0.1, 2, math.nan])

@@ -391,3 +391,10 @@ def test_a_last_checkpoint_of_another_training_is_named(command: Command, traine
     assert done.code == 1
     assert f"'{last}' does not fit this training" in done.err.splitlines()[-1]
     assert status(trained)["state"] == "failed"
+
+
+@pytest.mark.slow
+def test_another_optimiser_of_torch(command: Command) -> None:
+    """One that takes no fused update, with the options of AdamW."""
+    options = (*TINY, "optim=adamw", "optim._target_=torch.optim.RAdam", "trainer.max_epochs=1", "test=false")
+    assert command("train", *options).code == 0

@@ -174,3 +174,14 @@ def test_a_state_of_another_shape_is_refused() -> None:
     next(iter(optimizer.state.values()))["exp_avg"] = torch.zeros(7)
     with pytest.raises(ValueError, match="exp_avg is 7, its parameter 4 x 3 x 2 x 2"):
         fit_state(optimizer)
+
+
+def test_a_state_of_other_shapes_is_its_optimisers_business() -> None:
+    parameter = nn.Parameter(torch.randn(4, 3))
+    optimizer = torch.optim.Adafactor([parameter])
+    parameter.grad = torch.randn(4, 3)
+    optimizer.step()
+    shapes = {key: value.shape for key, value in optimizer.state[parameter].items()}
+    fit_state(optimizer)
+    assert {key: value.shape for key, value in optimizer.state[parameter].items()} == shapes
+    assert torch.Size([4, 3]) not in shapes.values()
