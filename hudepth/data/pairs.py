@@ -14,6 +14,7 @@ from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
 import cv2
@@ -25,7 +26,7 @@ from hudepth.base.images import resize_image
 from hudepth.base.machine import usable_cores
 from hudepth.data.encoding import is_invalid, to_metres
 from hudepth.data.sources.base import Record, Source
-from hudepth.data.store import MAX_STORED, MM_PER_M, OUTDOOR_PER_M, to_stored
+from hudepth.data.store import MAX_STORED, OUTDOOR_PER_M, SCALES, to_stored
 
 POOL_FROM = 32
 """Fewer pairs than this are prepared in this process: starting others would take longer."""
@@ -60,8 +61,9 @@ def read_metres(source: Source, record: Record, raw: NDArray[np.generic]) -> NDA
 
 
 def values_per_metre(source: Source) -> int:
-    """Return how finely a store holds a source's depth: in millimetres, or if it is not indoors in 1/256 m."""
-    return MM_PER_M if source.indoor else OUTDOOR_PER_M
+    """Return how many stored values make a metre: indoors 1000, else 256, or fewer if ``farthest_m`` needs them."""
+    scales = SCALES if source.indoor else SCALES[SCALES.index(OUTDOOR_PER_M) :]
+    return next(per_m for per_m in scales if (source.farthest_m or 0) <= MAX_STORED / per_m)
 
 
 def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, native: bool) -> PreparedPair:
@@ -72,23 +74,44 @@ def prepare_pair(source: Source, record: Record, size: tuple[int, int], *, nativ
     if not measured.size:
         raise DataError(f"'{record.depth or record.id}': {unmeasured(raw.depth)}")
     per_m = values_per_metre(source)
-    if float(measured.max()) > MAX_STORED / per_m:
+    if round(float(measured.max()) * per_m) > MAX_STORED:
         raise DataError(f"'{record.depth or record.id}': {_too_far(float(measured.max()), source)}")
     height, width = size
     image = resize_image(raw.image, size)
-    depth = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    if source.sparse:
+        depth = nearest_measured(depth_m, size)
+    else:
+        resized = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        depth = resized.astype(np.float32, copy=False)
     png = None
     if native:
         png = cv2.imencode(".png", to_stored(depth_m, per_m), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
     return PreparedPair(
         image=image,
-        stored_depth=to_stored(depth.astype(np.float32, copy=False), per_m),
+        stored_depth=to_stored(depth, per_m),
         native_png=None if png is None else png.astype(np.uint8, copy=False),
         native_size=(depth_m.shape[0], depth_m.shape[1]),
         range_m=(float(measured.min()), float(np.median(measured)), float(measured.max())),
         valid_fraction=measured.size / depth_m.size,
         no_reading=0.0 if source.invalid is not None else float(is_invalid(raw.depth, None).mean()),
     )
+
+
+def nearest_measured(depth_m: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Resize depths [H, W] to ``size`` (height, width); each pixel takes the measured one nearest to its centre.
+
+    Only pixels within its own area count, as the nearest pixel does: where none is measured, it stays 0. Where the map
+    grows, a measured pixel keeps to one pixel, so that sparse depth stays sparse.
+    """
+    (rows, columns), (height, width) = depth_m.shape, size
+    y, x = np.nonzero(depth_m > 0)
+    top, left = (y + 0.5) * height / rows, (x + 0.5) * width / columns  # in pixels of the result
+    to_row, to_column = top.astype(np.int64), left.astype(np.int64)
+    off_centre = (top - to_row - 0.5) ** 2 + (left - to_column - 0.5) ** 2
+    order = np.argsort(-off_centre, kind="stable")  # of several, the last one written stays
+    result = np.zeros(size, np.float32)
+    result[to_row[order], to_column[order]] = depth_m[y[order], x[order]]
+    return result
 
 
 def unmeasured(raw: NDArray[np.generic]) -> str:
@@ -105,7 +128,9 @@ def unmeasured(raw: NDArray[np.generic]) -> str:
 
 def _too_far(largest_m: float, source: Source) -> str:
     most = MAX_STORED / values_per_metre(source)
-    fix = "data.source.indoor=false for up to 255.996 m, " if source.indoor else ""
+    fix = f"data.source.farthest_m={ceil(largest_m)} if it is real, "
+    if source.indoor and largest_m <= MAX_STORED / OUTDOOR_PER_M:
+        fix = "data.source.indoor=false for up to 255.996 m, "
     return (
         f"its largest depth, {largest_m:.6g} m, is beyond the {most:.6g} m that a store holds. Pass {fix}another "
         "data.encoding if the unit is wrong, or data.invalid=[<value>] if it stands for no reading."

@@ -64,6 +64,7 @@ def store_path(source: Source, *, size: tuple[int, int], native: bool, cache: Pa
     """
     contents = hash_contents(source.name, source.files(), cache=cache)
     unit = [source.encoding, values_per_metre(source), source.depth_scale_m, source.invalid]
+    unit += ["sparse"] * source.sparse
     key = [VERSION, source.name, source.fingerprint(), contents, size, unit, native]
     return cache / f"{source.name}-{size[0]}x{size[1]}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
 

@@ -10,9 +10,8 @@ native/end              int64 [n]            where each of them ends
 records/<field>         [n]                  id, scene, frame, split, category of each pair
 ======================  ===================  ==========================================================
 
-The attribute ``per_metre`` says how many stored values make a metre: 1000, or 256 for sets that reach beyond 65 m. The
-attribute ``info`` is a JSON object with the source's name and fingerprint, encoding, depth range and skipped files. A
-file without it was never finished.
+The attribute ``per_metre`` is one of :data:`SCALES`. The attribute ``info`` is a JSON object with the source's name and
+fingerprint, encoding, depth range and skipped files. A file without it was never finished.
 """
 
 from __future__ import annotations
@@ -43,8 +42,9 @@ from hudepth.data.sources.hdf5 import RowFile, own_array
 FORMAT = "hudepth-depth-store"
 VERSION = 2
 MM_PER_M = 1000
-OUTDOOR_PER_M = 256
-"""Stored values per metre of a set that is not indoors, as KITTI stores them: up to 255.996 m."""
+OUTDOOR_PER_M = 256  # as KITTI
+SCALES = (MM_PER_M, *(OUTDOOR_PER_M >> shift for shift in range(9)))
+"""Stored values per metre that a store can have: up to 65.535 m, 255.996 m, 511.992 m, ..., 65,535 m."""
 MAX_STORED = int(np.iinfo(np.uint16).max)
 _AGAIN = "Delete it and prepare again."
 _TEXTS = ("id", "scene", "split", "category")
@@ -193,7 +193,7 @@ class DepthStore:
                 self.info: dict[str, Any] = dict(json.loads(file.attrs["info"]))
                 self.per_m = int(file.attrs.get("per_metre", MM_PER_M))  # stored depths are so many to the metre
                 self.records, self.size, self.has_native = _read_layout(file)
-            if self.per_m not in (MM_PER_M, OUTDOOR_PER_M):
+            if self.per_m not in SCALES:
                 raise ValueError(f"per_metre is {self.per_m}")
         except (OSError, RuntimeError, KeyError, TypeError, ValueError, ConfigError) as error:
             fix = _AGAIN

@@ -12,7 +12,8 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
 from hudepth.base.camera import Intrinsics
-from hudepth.data.store import to_mm
+from hudepth.base.errors import DataError
+from hudepth.data.store import MAX_STORED, MM_PER_M, to_mm
 from hudepth.viz.colour import colour_depth
 from hudepth.viz.point_cloud import PointCloud, point_cloud
 
@@ -46,7 +47,12 @@ class DepthMap:
     notes: tuple[str, ...] = ()  # what reading changed in the image, if it is not obvious
 
     def to_png16(self) -> bytes:
-        """Return a 16-bit PNG file in millimetres, as NYU, ScanNet and Kinect tools use: rounded, at most 65.535 m."""
+        """Return a 16-bit PNG file in millimetres, as NYU, ScanNet and Kinect tools use: rounded.
+
+        Raises DataError if a depth is beyond 65.535 m, the most that such a file holds.
+        """
+        if round((largest := float(self.metres.max(initial=0))) * MM_PER_M) > MAX_STORED:
+            raise DataError(f"depth of {largest:.5g} m, 16-bit millimetres hold 65.535 m. Use formats=[npy].")
         return cv2.imencode(".png", to_mm(self.metres), FAST_PNG)[1].tobytes()
 
     def colourise(

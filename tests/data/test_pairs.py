@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.base.errors import ConfigError, DataError
-from hudepth.data.pairs import POOL_FROM, PreparedPair, prepare_pair, prepare_pairs, read_metres
+from hudepth.data.pairs import (
+    POOL_FROM,
+    PreparedPair,
+    nearest_measured,
+    prepare_pair,
+    prepare_pairs,
+    read_metres,
+    values_per_metre,
+)
 from hudepth.data.sources.base import RawPair, Record, Source
 from hudepth.data.sources.folder import FolderSource
 
@@ -112,7 +121,10 @@ def test_nothing_measured(value: float, depth: str, name: str) -> None:
     assert ("sign" in str(caught.value)) == (value < 0)
 
 
-@pytest.mark.parametrize(("indoor", "largest", "fix"), [(True, 65.6, "indoor=false"), (False, 256.0, "data.invalid")])
+@pytest.mark.parametrize(
+    ("indoor", "largest", "fix"),
+    [(True, 65.6, "indoor=false"), (True, 300, "farthest_m=300"), (False, 256.5, "farthest_m=257")],
+)
 def test_what_a_store_cannot_hold_is_refused(indoor: bool, largest: float, fix: str) -> None:
     depth = np.full((4, 4), 2.0, np.float32)
     depth[0, 0] = largest
@@ -120,6 +132,61 @@ def test_what_a_store_cannot_hold_is_refused(indoor: bool, largest: float, fix: 
     source.indoor = indoor
     with pytest.raises(DataError, match=rf"'0': .*{largest:g} m.*{fix}"):
         prepare_pair(source, source.records()[0], (2, 2), native=True)
+
+
+@pytest.mark.parametrize(
+    ("indoor", "farthest_m", "per_m"),
+    [(True, None, 1000), (True, 65.535, 1000), (True, 66, 256), (False, None, 256), (False, 50, 256),
+     (False, 255.9, 256), (False, 256, 128), (False, 350, 128), (False, 600, 64), (False, 65_535, 1)],
+)  # fmt: skip
+def test_steps_are_as_fine_as_the_farthest_depth_allows(indoor: bool, farthest_m: float | None, per_m: int) -> None:
+    depth = np.full((4, 4), 2.0, np.float32)
+    depth[1, 1] = 80.0 if farthest_m is None else farthest_m
+    source = MemorySource([RawPair(np.zeros((4, 4, 3), np.uint8), depth)])
+    source.indoor, source.farthest_m = indoor, farthest_m
+    if indoor and farthest_m is None:
+        depth[1, 1] = 65.535
+    assert values_per_metre(source) == per_m
+    prepared = prepare_pair(source, source.records()[0], (4, 4), native=True)
+    assert prepared.native_png is not None
+    native = cv2.imdecode(prepared.native_png, cv2.IMREAD_UNCHANGED)
+    for stored in (prepared.stored_depth, native):
+        assert abs(stored[1, 1] / per_m - depth[1, 1]) <= 0.5 / per_m
+        assert stored[0, 0] == 2 * per_m
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 12), st.integers(1, 12), st.integers(0, 9))
+def test_sparse_depth_takes_the_nearest_measured_pixel(
+    rows: int, columns: int, height: int, width: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    depth = np.where(rng.random((rows, columns)) < 0.3, rng.uniform(1, 80, (rows, columns)), 0).astype(np.float32)
+    found = nearest_measured(depth, (height, width))
+    for i in range(height):
+        for j in range(width):
+            # exact: centres in units of 1 / (2 rows) and 1 / (2 columns) of the result's pixels
+            inside = {
+                (y, x): (Fraction((2 * y + 1) * height, 2 * rows) - i - Fraction(1, 2)) ** 2
+                + (Fraction((2 * x + 1) * width, 2 * columns) - j - Fraction(1, 2)) ** 2
+                for y, x in zip(*(each.tolist() for each in np.nonzero(depth)), strict=True)
+                if (2 * y + 1) * height // (2 * rows) == i and (2 * x + 1) * width // (2 * columns) == j
+            }
+            nearest_ones = {depth[at] for at, off in inside.items() if off <= min(inside.values()) + Fraction(1, 10**9)}
+            assert found[i, j] in (nearest_ones or {0})
+
+
+def test_sparse_depth_survives_shrinking() -> None:
+    """As at KITTI's training sizes: most points lie beside the pixels that nearest resizing takes."""
+    depth = np.zeros((375, 1242), np.float32)
+    depth[150::5, ::7] = 80.0
+    source = MemorySource([RawPair(np.zeros((375, 1242, 3), np.uint8), depth)])
+    source.indoor = False
+    shares = []
+    for source.sparse in (False, True):
+        prepared = prepare_pair(source, source.records()[0], (96, 320), native=True)
+        shares.append(np.mean(prepared.stored_depth > 0))
+        assert set(np.unique(prepared.stored_depth)) == {0, 80 * 256}
+    assert shares[1] > 10 * shares[0]
 
 
 def test_the_records_scale_and_offset_are_applied() -> None:

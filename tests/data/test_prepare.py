@@ -342,6 +342,16 @@ def test_implausible_units_are_refused_before_the_rest_is_read(root: Path, cache
     assert len(prepare(source, size=SIZE, cache=cache, workers=1)) == 40
 
 
+def test_depth_that_is_kept_sparse_has_a_store_of_its_own(root: Path, cache: Path) -> None:
+    source = write_set(root, 1)
+    paths = {store_path(source, size=SIZE, native=True, cache=cache)}
+    source.sparse = True
+    paths.add(store_path(source, size=SIZE, native=True, cache=cache))
+    source.farthest_m = 100
+    paths.add(store_path(source, size=SIZE, native=True, cache=cache))
+    assert len(paths) == 3
+
+
 @pytest.mark.parametrize("on_error", ["raise", "skip"])
 def test_a_wrong_encoding_is_refused_before_the_rest_is_read(root: Path, cache: Path, on_error: str) -> None:
     write_set(root, 40)

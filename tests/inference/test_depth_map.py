@@ -11,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from hudepth.base.errors import DataError
 from hudepth.inference.depth_files import FORMATS, Style, write_depth
 from hudepth.inference.depth_map import DepthMap
 
 shapes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)
-depths = hnp.arrays(np.float32, shapes, elements=st.floats(0, 80, width=32))
+depths = hnp.arrays(np.float32, shapes, elements=st.floats(0, 65.5, width=32))
 
 
 @given(depths)
@@ -23,12 +24,18 @@ def test_png16_is_within_half_a_millimetre(metres: np.ndarray) -> None:
     image = np.zeros((*metres.shape, 3), np.uint8)
     stored = cv2.imdecode(np.frombuffer(DepthMap(metres, image, 10.0).to_png16(), np.uint8), cv2.IMREAD_UNCHANGED)
     assert stored.dtype == np.uint16
-    kept = np.minimum(metres, np.float32(65.535)).astype(np.float64)
+    kept = metres.astype(np.float64)
     wrong = np.abs(stored / 1000 - kept)
     tiny = (kept > 0) & (kept < 0.0005)  # measured, so never 0, which says unmeasured
     assert (wrong[~tiny] <= 0.0005 + 1e-6).all()
     assert (stored[tiny] == 1).all()
     assert ((stored == 0) == (metres == 0)).all()
+
+
+def test_png16_does_not_cut_depth() -> None:
+    depth = DepthMap(np.array([[1.0, 80.0]], np.float32), np.zeros((1, 2, 3), np.uint8), 80.0)
+    with pytest.raises(DataError, match=r"depth of 80 m, 16-bit millimetres hold 65\.535 m\. Use formats=\[npy\]"):
+        depth.to_png16()
 
 
 def test_pictures_and_points() -> None:

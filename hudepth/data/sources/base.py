@@ -48,6 +48,8 @@ class RawPair:
 
 
 _SCALE = Annotated[float, Range(0, above=True)]
+FARTHEST = Annotated[float, Range(0, 65_535, above=True)]
+"""A depth [m] that 16 bits can hold in whole metres."""
 
 
 class Source(ABC):
@@ -67,6 +69,10 @@ class Source(ABC):
     """How depth values become metres; one of :data:`hudepth.data.encoding.ENCODINGS`."""
     indoor: bool = True
     """Whether depths must be plausible for rooms."""
+    farthest_m: float | None = None
+    """Largest depth [m] the store must hold; None: 65.535 m indoors, else 255.996 m. Steps are as fine as it allows."""
+    sparse: bool = False
+    """Whether few pixels are measured, as by a lidar: measured ones are preferred at training size."""
     depth_scale_m: float | None = None
     """Scale of ``linear`` and ``disparity`` where a record has none; see :func:`hudepth.data.encoding.to_metres`."""
     invalid: Sequence[float] | None = None
@@ -80,6 +86,7 @@ class Source(ABC):
         self.encoding = convert("data.encoding", self.encoding, Encoding | None)
         self.depth_scale_m = convert("data.depth_scale_m", self.depth_scale_m, _SCALE | None)
         self.invalid = convert("data.invalid", self.invalid, list[float] | None)
+        self.farthest_m = convert("data.source.farthest_m", self.farthest_m, FARTHEST | None)
         if self.depth_scale_m is not None and self.encoding not in (None, "auto", "linear", "disparity"):
             raise ConfigError(
                 f"data.depth_scale_m: data.encoding={self.encoding} has a scale of its own. "

@@ -38,6 +38,8 @@ class FolderSource(FileSource):
     depth_suffix: str = ""
     encoding: Encoding | None = None  # type: ignore[assignment]  # checked by records()
     indoor: bool = True
+    farthest_m: float | None = None
+    sparse: bool = False
     unequal_sizes: bool = False
 
     def records(self) -> Sequence[Record]:

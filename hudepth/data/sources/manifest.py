@@ -49,6 +49,8 @@ class ManifestSource(FileSource):
     manifest: str = "index.csv"
     encoding: Encoding = "auto"
     indoor: bool = True
+    farthest_m: float | None = None
+    sparse: bool = False
     unequal_sizes: bool = False
 
     def records(self) -> Sequence[Record]:

@@ -18,6 +18,7 @@ FAR_INDOORS_M = 8.0
 
 _AUTO_MEDIAN_M = (0.8, FAR_INDOORS_M)
 _AUTO_MAX_M = 15.0  # sensors that store 16-bit millimetres see no farther; KITTI read so reaches 20 m
+_AUTO_ASPECT = 2.5  # width over height: no depth camera for rooms is as wide as KITTI's, 3.3
 
 
 class DepthRange(NamedTuple):
@@ -64,7 +65,9 @@ def check_range(
 def _check_guess(found: DepthRange, raws: Sequence[NDArray[np.generic]], *, indoor: bool, name: str) -> None:
     """Refuse what ``auto`` takes for millimetres or metres if it may as well be something else."""
     usual = _AUTO_MEDIAN_M[0] <= found.median_m <= _AUTO_MEDIAN_M[1]
-    if any(raw.dtype == np.uint16 for raw in raws) and not (indoor and usual and found.max_m <= _AUTO_MAX_M):
+    wide = any(raw.shape[1] > _AUTO_ASPECT * raw.shape[0] for raw in raws)
+    usual = usual and found.max_m <= _AUTO_MAX_M and not wide
+    if any(raw.dtype == np.uint16 for raw in raws) and not (indoor and usual):
         raise DataError(
             f"data.encoding=auto: '{name}' holds 16-bit depth with a median of {found.median_m:.3g} m and up to "
             f"{found.max_m:.3g} m if it is millimetres, but it may be KITTI's 1/256 m or another unit. Pass "

@@ -36,6 +36,13 @@ def test_auto_does_not_guess_a_unit() -> None:
             check_range([to_metres(raw, "auto")], indoor=indoor, encoding="auto", name="x", raws=[raw])
 
 
+def test_auto_does_not_take_wide_images_for_rooms() -> None:
+    raw = np.tile(np.uint16([2000, 4000]), (8, 16))  # as near as KITTI may be: 4 m and 8 m, 7.8 m and 15.6 m in truth
+    with pytest.raises(DataError, match=r"data\.encoding=auto: .*KITTI"):
+        check_range([to_metres(raw, "auto")], indoor=True, encoding="auto", name="x", raws=[raw])
+    assert check_range([to_metres(raw.T, "auto")], indoor=True, encoding="auto", name="x", raws=[raw.T]).max_m == 4
+
+
 def test_auto_does_not_take_inverse_depth_for_metres() -> None:
     raw = (1000 / SURFACE).astype(np.float32)
     with pytest.raises(DataError, match=r"data\.encoding=auto: .*disparity"):
