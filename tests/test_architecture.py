@@ -14,7 +14,7 @@ FILES = {
 }
 LEVELS = (
     {"base"},
-    {"models", "losses", "metrics"},
+    {"models", "losses", "metrics", "cuda"},
     {"runs", "viz"},
     {"data"},
     {"training", "inference", "evaluation"},

@@ -10,19 +10,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.masked import widest_float
 from hudepth.base.options import convert
 from hudepth.models.options import ACTIVATIONS, choose
 
+CPU = torch.device("cpu")
 
-def sine_positions(channels: int, height: int, width: int) -> Float[Tensor, "c h w"]:
+
+def sine_positions(channels: int, height: int, width: int, *, device: torch.device = CPU) -> Float[Tensor, "c h w"]:
     """Return sines and cosines of row and column, each over half the channels (Carion et al. 2020, DETR), in float64.
+
+    On a device without float64 they are float32.
 
     Half of each half are sines, half cosines, of angles that fall geometrically from 1 to 1/10000 per pixel (Vaswani et
     al. 2017). ``channels``: a multiple of 4.
     """
     count = channels // 4
-    frequency = torch.exp(torch.arange(count, dtype=torch.float64) * (-math.log(10_000) / count))[:, None]
-    rows, columns = (frequency * torch.arange(length) for length in (height, width))  # [c/4, length]
+    steps = torch.arange(max(count, height, width), dtype=widest_float(device), device=device)
+    frequency = torch.exp(steps[:count] * (-math.log(10_000) / count))[:, None]
+    rows, columns = (frequency * steps[:length] for length in (height, width))  # [c/4, length]
     rows = torch.cat([rows.sin(), rows.cos()])[:, :, None].expand(-1, -1, width)
     columns = torch.cat([columns.sin(), columns.cos()])[:, None, :].expand(-1, height, -1)
     return torch.cat([rows, columns])
@@ -67,7 +73,7 @@ class TransformerBlock(nn.Module):
         tokens: Tensor = x.flatten(2).transpose(1, 2)
         queries = tokens
         if self.positions == "sine":  # not added to the values: they reach the decoder
-            encoding = sine_positions(*x.shape[1:]).to(x)
+            encoding = sine_positions(*x.shape[1:], device=x.device).to(x.dtype)
             queries = tokens + encoding.flatten(1).T
         tokens = self.norm1(tokens + self.attention(queries, queries, tokens, need_weights=False)[0])
         tokens = self.norm2(tokens + self.feed_forward(tokens))

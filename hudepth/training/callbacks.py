@@ -83,6 +83,21 @@ class EpochSeed(Callback):
             torch.manual_seed(epoch_seed("train", self.seed, trainer.current_epoch, trainer.global_rank))
 
 
+class CompileTime(Callback):
+    """Says that torch.compile is at work, which makes the first step of each size take long, and how long it took."""
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Announce the wait."""
+        log.info("compile: the first step of each image size builds its kernels, which takes a minute or more")
+        self._start: float | None = time.monotonic()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Log the time of the first step."""
+        if self._start is not None:
+            log.info("compile: the first step took %s", duration(time.monotonic() - self._start))
+            self._start = None
+
+
 class EpochLine(Callback):
     """Logs one line per epoch: losses, the metric ``monitor``, other metrics, time taken and time left."""
 

@@ -156,6 +156,7 @@ def build_module(
         distill=instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None,
         scheduler=schedule if has_target(config["schedule"]) else None,
         record={"config": dict(config), "split": datamodule.split.summary(), "data": data},
+        cuda_graph=bool(config.get("cuda_graph", True)),
     )
 
 

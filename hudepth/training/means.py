@@ -14,21 +14,24 @@ class EpochMeans:
     """Means of named values, each the mean over a batch, over all images of an epoch."""
 
     def __init__(self) -> None:
-        self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}
+        self._sums: dict[tuple[str, ...], Tensor] = {}  # of each value, then the number of images
 
     def add(self, values: Mapping[str, Tensor], *, images: int) -> None:
         """Add scalars of a batch; other batches may have others."""
         names = tuple(values)
         new = torch.stack([value.detach() for value in values.values()])
-        sums, count = self._sums.get(names) or (torch.zeros_like(new, dtype=widest_float(new.device)), 0)
-        self._sums[names] = sums.add_(new, alpha=images), count + images
+        if names not in self._sums:
+            self._sums[names] = new.new_zeros(len(names) + 1, dtype=widest_float(new.device))
+        sums = self._sums[names]  # stays where it is: a CUDA graph adds to it
+        sums[:-1].add_(new, alpha=images)
+        sums[-1:].add_(images)
 
     def take(self, reduce: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         """Return the means and begin again; ``reduce`` sums a tensor over processes."""
         totals: dict[str, Tensor] = {}
-        for names, (sums, count) in self._sums.items():
-            summed = reduce(torch.cat([sums, sums.new_tensor([count])]))
+        for names, sums in self._sums.items():
+            summed = reduce(sums.clone())
+            sums.zero_()
             for name, total in zip(names, summed[:-1], strict=True):
                 totals[name] = totals.get(name, 0) + torch.stack([total, summed[-1]])
-        self._sums = {}
-        return {name: (total / count).float() for name, (total, count) in totals.items()}
+        return {name: (total / count).float() for name, (total, count) in totals.items() if count}

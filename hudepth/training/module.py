@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth.base.errors import ConfigError, TrainingError
 from hudepth.base.types import Batch
+from hudepth.cuda.steps import StepGraphs
 from hudepth.losses.distillation import Distillation
 from hudepth.metrics.collection import validation_metrics, validation_names
 from hudepth.runs import checkpoint as ckpt
@@ -58,6 +59,7 @@ class DepthModule(LightningModule):
             after every step, others after every epoch. None for a constant rate.
         distill: distance from a teacher's depths, added to the loss of training batches that have them.
         record: plain values stored in each checkpoint, for example ``config``.
+        cuda_graph: replay steps on a GPU where they can be recorded; see :class:`hudepth.cuda.steps.StepGraphs`.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class DepthModule(LightningModule):
         scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
         distill: Distillation | None = None,
         record: dict[str, Any] | None = None,
+        cuda_graph: bool = True,
     ) -> None:
         super().__init__()
         self.net, self.loss, self.distill, self.max_depth_m = net, loss, distill, max_depth_m
@@ -79,6 +82,7 @@ class DepthModule(LightningModule):
         self._unchecked: list[_Step] = []
         self._emptied: list[_Step] = []  # in this epoch
         self._losses = {"train": EpochMeans(), "val": EpochMeans()}
+        self._graphs = StepGraphs(wanted=cuda_graph)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Predict unit depth from normalised images."""
@@ -87,12 +91,28 @@ class DepthModule(LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
-        total = self._step(batch, "train")
+        total = self._graphs.loss(partial(self._step, stage="train"), batch)
+        if self._graphs.mode == "record":
+            return total
         emptied = batch["emptied"] if "emptied" in batch else torch.zeros_like(total, dtype=torch.bool)
         self._unchecked.append(_Step(batch_idx, batch["index"], total.detach(), emptied))
         if len(self._unchecked) >= CHECK_EVERY.get(total.device.type, 50):
             self._check_losses()
         return total
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Remember the batch for ``optimizer_step``."""
+        self._batch = batch
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        """Take a step as Lightning does, or replay one."""
+        usual = partial(super().optimizer_step, epoch, batch_idx, optimizer, optimizer_closure)
+        self._graphs.run(usual, optimizer_closure, self._batch)
+
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Compute the gradients, unless a replay did."""
+        if self._graphs.mode != "replay":
+            super().backward(loss, *args, **kwargs)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Log the loss of a batch and add it to the metrics."""
@@ -197,6 +217,7 @@ class DepthModule(LightningModule):
         """Check what was restored: the optimiser's state, and over how many steps the schedule was laid out."""
         for optimizer in self.trainer.optimizers:
             fit_state(optimizer)
+        self._graphs.start(self.trainer)
         scheduler = self.lr_schedulers() if self._make_scheduler else None
         steps = self.trainer.estimated_stepping_batches
         if isinstance(scheduler, StepSchedule) and scheduler.total_steps != steps:

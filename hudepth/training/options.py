@@ -90,6 +90,7 @@ class TrainOptions:
     baselines: bool = True
     init: str | None = None
     memory_format: Literal["auto", "contiguous", "channels_last"] = "auto"
+    cuda_graph: bool = True
     compile: bool = False
     variant: str | None = None
     sweep_dir: str | None = None

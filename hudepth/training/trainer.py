@@ -23,7 +23,7 @@ from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.pictures import evenly_spaced
 from hudepth.runs import history
 from hudepth.runs.checkpoint import AtomicCheckpointIO
-from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
+from hudepth.training.callbacks import CompileTime, EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
 from hudepth.training.checkpointing import FullSizeEarlyStopping, checkpoint_callbacks
 from hudepth.training.loggers import drop_on_failure
 from hudepth.training.study import TRIAL_ENV, TrialPruner
@@ -37,6 +37,8 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
         Interrupt(), EpochSeed(config["seed"]), LogLosses(), History(path / history.FILE), Times(path / "times.csv"),
         EpochLine(monitor),
     ]  # fmt: skip
+    if config.get("compile"):
+        callbacks.append(CompileTime())
     if options["panels"]:
         indices = evenly_spaced(sorted(datamodule.split.val), options["panels"])
         how = {"every_n_epochs": options["panels_every_n_epochs"], "max_depth_m": datamodule.max_depth_m}
