@@ -50,3 +50,8 @@ def record(function: Callable[[], Any], *, pool: Any = None) -> Recording:
     with beside() as stream, torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
         results = function()
     return Recording(graph.replay, results, graph.pool())
+
+
+def first_line(error: Exception) -> str:
+    """Return why a recording failed, in at most 200 characters."""
+    return next((line for line in str(error).splitlines() if line), type(error).__name__)[:200]

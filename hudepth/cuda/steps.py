@@ -110,7 +110,7 @@ class StepGraphs:
             self._steps[key] = self._record(step, tensors, optimizer)
         except Exception as error:  # networks, losses and callbacks may do anything, and training goes on without
             optimizer.zero_grad()
-            self._give_up(next((line for line in str(error).splitlines() if line), type(error).__name__)[:200])
+            self._give_up(graphs.first_line(error))
             return None
         sizes = ", ".join(f"{name} {' x '.join(map(str, x.shape))}" for name, x in tensors.items())
         log.info("training steps of %s are replayed as a CUDA graph", sizes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -82,15 +82,42 @@ class Augmentation:
         aspect: float,
         generator: torch.Generator,
     ) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
+        """Draw random numbers and :meth:`apply` them; ``generator`` as in :meth:`draw`."""
+        draws = self.draw(len(image), size=size, generator=generator, device=image.device)
+        return self.apply(image, unit_depth, size=size, aspect=aspect, draws=draws)
+
+    def draw(
+        self, count: int, *, size: tuple[int, int], generator: torch.Generator, device: torch.device
+    ) -> dict[str, Tensor]:
+        """Draw all random numbers for ``count`` images, from a generator of the CPU: the same ones on every device.
+
+        Returns:
+            ``numbers`` [n, count], uniform in [0, 1), and if there is noise, ``noise`` [count, 3, *size], normal.
+        """
+        draws = {"numbers": torch.rand(_DRAWS, count, generator=generator).to(device, non_blocking=True)}
+        if self.noise:
+            there = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
+            draws["noise"] = torch.randn(count, 3, *size, generator=there, device=device)
+        return draws
+
+    def apply(
+        self,
+        image: Float[Tensor, "b 3 h w"],
+        unit_depth: Float[Tensor, "b d h w"],
+        *,
+        size: tuple[int, int],
+        aspect: float,
+        draws: Mapping[str, Tensor],
+    ) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
         """Change a batch and resize it to ``size``.
 
         Args:
             image: RGB in [0, 1].
             unit_depth: depth / max_depth_m, not clipped, 0 where unmeasured: the ground truth, then a teacher's depth.
             aspect: width over height of the scene.
-            generator: of the CPU, whatever device the batch is on: the same draws everywhere.
+            draws: of :meth:`draw`.
         """
-        draw = _Draw(len(image), generator, image.device)
+        draw = _Draw(draws["numbers"])
         image, unit_depth = cut_border(image, unit_depth, self.border)
         if self._moves:
             geometry = self._draw_geometry(draw)
@@ -112,7 +139,7 @@ class Augmentation:
             )
         if self.noise:
             sigma = draw.uniform(0, self.noise)[:, None, None, None]
-            image = draw.normal_like(image).mul_(sigma).add_(image).clamp_(0, 1)
+            image = (draws["noise"] * sigma).add_(image).clamp_(0, 1)
         if self.cut_depth:
             image = cut_depth(image, unit_depth[:, :1].clamp(max=1), self._draw_box(draw))
         return image, unit_depth
@@ -139,11 +166,10 @@ class Augmentation:
 
 
 class _Draw:
-    """Random numbers, one per image: drawn on the CPU all at once, used on the device."""
+    """Random numbers, one per image, handed out in the order in which they are used."""
 
-    def __init__(self, count: int, generator: torch.Generator, device: torch.device) -> None:
-        self.generator = generator
-        self._rows = iter(torch.rand(_DRAWS, count, generator=generator).to(device, non_blocking=True))
+    def __init__(self, numbers: Tensor) -> None:
+        self._rows = iter(numbers)
 
     def uniform(self, low: float, high: float) -> Tensor:
         numbers: Tensor = next(self._rows)
@@ -154,7 +180,3 @@ class _Draw:
 
     def chance(self, probability: float) -> Tensor:
         return self.uniform(0, 1) < probability
-
-    def normal_like(self, x: Tensor) -> Tensor:
-        seed = int(torch.randint(2**62, (), generator=self.generator))
-        return torch.randn(x.shape, generator=torch.Generator(x.device).manual_seed(seed), device=x.device)

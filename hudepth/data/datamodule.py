@@ -24,7 +24,7 @@ from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
 from hudepth.data.dataset import BlockShuffle, DeviceDataset, LateLoader, ShardSampler, StoreDataset, as_is, on_device
 from hudepth.data.prepare import OnError, prepare, share_beyond
-from hudepth.data.preprocess import preprocess
+from hudepth.data.preprocess import TrainingBatches, preprocess
 from hudepth.data.resolution import read_stages, size_at
 from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split, check_split, make_split
@@ -109,6 +109,7 @@ class DepthDataModule(LightningDataModule):
             source.unpaired = []
         self._told = False
         self._draws: tuple[int, torch.Generator] | None = None
+        self._training_batches = TrainingBatches(augment, max_depth_m=self.max_depth_m)
 
     @cached_property
     def store(self) -> DepthStore:
@@ -198,8 +199,7 @@ class DepthDataModule(LightningDataModule):
         """
         training = self.trainer is not None and self.trainer.training
         if training:
-            augment = self.augment and partial(self.augment, aspect=self._aspect, generator=self._generator())
-            return preprocess(batch, max_depth_m=self.max_depth_m, size=self.train_size, augment=augment)
+            return self._training_batches(batch, size=self.train_size, aspect=self._aspect, generator=self._generator())
         result = preprocess(batch, max_depth_m=self.max_depth_m)
         if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING and self.train_size != self.size:
             result["small_image"] = functional.interpolate(result["image"], self.train_size, mode="area")

@@ -12,8 +12,10 @@ from omegaconf import OmegaConf
 
 from hudepth.base.instantiate import instantiate
 from hudepth.base.types import Batch
+from hudepth.data.augment import Augmentation
 from hudepth.losses.distillation import Distillation
 from hudepth.training.module import DepthModule
+from tests.data.test_augment import EVERYTHING
 from tests.devices import staying_on
 
 LOSSES = ("badcl", "berhu", "gradient", "l1", "l2", "mixture", "silog")
@@ -55,3 +57,10 @@ def test_a_step_stays_on_its_device(overrides: list[str], monkeypatch: pytest.Mo
     with staying_on("meta"):
         module._step(batch, "train").backward()
     assert all(each.grad is not None for each in module.net.parameters())
+
+
+def test_augmentation_stays_on_its_device() -> None:
+    image, depth = torch.rand(2, 3, 24, 32, device="meta"), torch.rand(2, 2, 24, 32, device="meta")
+    draws = {"numbers": torch.rand(21, 2, device="meta"), "noise": torch.randn(2, 3, 24, 32, device="meta")}
+    with staying_on("meta"):
+        Augmentation(**EVERYTHING).apply(image, depth, size=(24, 32), aspect=4 / 3, draws=draws)
