@@ -32,6 +32,8 @@ from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
 
 _COUNT = Annotated[int, Range(1)]
+EVALUATION_BATCH = 4
+"""Batches that evaluation takes at once on a GPU: it keeps nothing for gradients, and small batches leave it idle."""
 MAX_WORKERS = 1024
 """Loader and preparing processes at most; more would only take the memory of the machine."""
 _WORKERS = Annotated[int, Range(1, MAX_WORKERS)]
@@ -49,7 +51,7 @@ class DepthDataModule(LightningDataModule):
         size: (height, width) of training images, or one number for a square; the paper's is 224 x 224.
         split, split_seed, fractions: see :func:`hudepth.data.splits.make_split`; by default the paper's.
         max_depth_m: maximum depth [m] (the paper: 10); depth is clipped to it and divided by it.
-        batch_size: pairs per step (the paper: 8).
+        batch_size: pairs per step (the paper: 8); evaluation on a GPU takes four times as many at once.
         progressive: smaller sizes to start with, each until a share of the epochs:
             ``[{size: [112, 112], until: 0.4}]``; see :func:`hudepth.data.resolution.read_stages`.
         teacher: folder of another model's depths; see :class:`hudepth.data.teacher.TeacherDepths`.
@@ -160,18 +162,22 @@ class DepthDataModule(LightningDataModule):
         dataset = self._training_pairs()
         # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees the same order.
         if self.shuffle_block is None:
-            return self._loader(dataset, DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed))
+            order: Any = DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed)
+            return self._loader(dataset, order, self.batch_size)
         sampler = BlockShuffle(
             dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
             read_ahead=self.store.read_ahead,
         )  # fmt: skip
-        return self._loader(dataset, sampler)
+        return self._loader(dataset, sampler, self.batch_size)
 
     def _training_pairs(self) -> StoreDataset:
         pairs = StoreDataset(self.store, self.split.train, teacher=self.teacher)
-        device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
-        wanted = device.type == "cuda" if self.on_device == "auto" else self.on_device == "true"
-        return on_device(pairs, device) if wanted and pairs.teacher is None else pairs
+        wanted = self._device.type == "cuda" if self.on_device == "auto" else self.on_device == "true"
+        return on_device(pairs, self._device) if wanted and pairs.teacher is None else pairs
+
+    @property
+    def _device(self) -> torch.device:
+        return torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
 
     def val_dataloader(self) -> DataLoader[RawBatch]:
         """Validation batches, in the store's order."""
@@ -221,15 +227,17 @@ class DepthDataModule(LightningDataModule):
 
     def _evaluation_loader(self, dataset: StoreDataset) -> DataLoader[RawBatch]:
         rank, world_size = self._shard()
-        return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size))
+        count = self.batch_size * (EVALUATION_BATCH if self._device.type == "cuda" else 1)
+        if dataset.native:
+            largest = max((h * w for h, w in self.store.info.get("native_sizes") or []), default=1)
+            count = min(count, max(1, MAX_NATIVE_PIXELS // largest))
+        return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size), count)
 
-    def _loader(self, dataset: StoreDataset, sampler: Any) -> DataLoader[RawBatch]:
-        largest = max((h * w for h, w in self.store.info.get("native_sizes") or []), default=1)
-        fit = max(1, MAX_NATIVE_PIXELS // largest) if dataset.native else self.batch_size
+    def _loader(self, dataset: StoreDataset, sampler: Any, batch_size: int) -> DataLoader[RawBatch]:
         there = isinstance(dataset, DeviceDataset)
         return LateLoader(
             dataset,
-            min(self.batch_size, fit),
+            batch_size,
             sampler=sampler,
             num_workers=0 if there else self.num_workers,
             collate_fn=as_is,

@@ -15,6 +15,7 @@ from hudepth.base.devices import build_trainer, check_shares, without_known_warn
 from hudepth.base.errors import ConfigError
 from hudepth.base.files import output_folder
 from hudepth.base.instantiate import import_trusted
+from hudepth.base.machine import float32_products
 from hudepth.base.options import Range
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
@@ -103,7 +104,8 @@ def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options:
             inference_mode=True,
         )
         check_shares(trainer, subset="test", pairs=len(datamodule.split.test))
-        trainer.test(evaluation, datamodule=datamodule, verbose=False)
+        with float32_products(tf32=False):  # figures should not depend on the device
+            trainer.test(evaluation, datamodule=datamodule, verbose=False)
     return trainer.is_global_zero
 
 

@@ -151,6 +151,15 @@ def test_large_native_truths_come_in_smaller_batches(make: Make, monkeypatch: py
     assert len(next(iter(data.train_dataloader()))["index"]) == 5
 
 
+def test_evaluation_on_a_gpu_takes_more_pairs_at_once(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DepthDataModule, "_device", torch.device("cuda"))
+    data = make(split="official", batch_size=1, on_device=False)
+    sizes = [[len(raw["index"]) for raw in loader] for loader in (data.val_dataloader(), data.test_dataloader())]
+    assert all(counts[:-1] == [4] * (len(counts) - 1) and counts[-1] <= 4 for counts in sizes)
+    assert sum(sizes[1]) == len(data.split.test) > 4
+    assert len(next(iter(data.train_dataloader()))["index"]) == 1
+
+
 def test_a_store_without_native_truth_gives_none(make: Make) -> None:
     data = make(native=False)
     raw = next(iter(data.test_dataloader()))
