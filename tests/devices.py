@@ -18,6 +18,7 @@ from hudepth.cuda import graphs
 _WAITING = {
     torch.ops.aten._local_scalar_dense.default, torch.ops.aten.nonzero.default, torch.ops.aten.masked_select.default,
     torch.ops.aten.is_nonzero.default, torch.ops.aten.equal.default,
+    torch.ops.aten.item.default,  # under inference_mode it comes as one operation
 }  # fmt: skip
 """Operations for whose result the host waits."""
 
@@ -88,6 +89,8 @@ def with_graphs() -> Iterator[None]:
         mock.patch.object(graphs, "has_graphs", return_value=True),
         mock.patch.object(graphs, "beside", nullcontext),
         mock.patch.object(graphs, "record", _record),
+        mock.patch.object(graphs, "host_memory", torch.empty_like),
+        mock.patch.object(graphs, "wait"),
     ):
         yield
 

@@ -52,6 +52,16 @@ def record(function: Callable[[], Any], *, pool: Any = None) -> Recording:
     return Recording(graph.replay, results, graph.pool())
 
 
+def host_memory(like: torch.Tensor) -> torch.Tensor:
+    """Return memory of the host that is page-locked, without which a copy from or to it cannot be recorded."""
+    return torch.empty(like.shape, dtype=like.dtype, pin_memory=True)
+
+
+def wait() -> None:
+    """Wait for the device to finish what this thread launched."""
+    torch.cuda.current_stream().synchronize()
+
+
 def first_line(error: Exception) -> str:
     """Return why a recording failed, in at most 200 characters."""
     return next((line for line in str(error).splitlines() if line), type(error).__name__)[:200]

@@ -14,10 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.machine import float32_products
 from hudepth.base.normalise import NormaliseBytes
+from hudepth.cuda import graphs
+from hudepth.cuda.arrays import ArrayGraphs
 from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import (
     KEY,
+    OPENVINO_PRECISIONS,
     onnx_description,
     onnx_session,
     openvino_description,
@@ -25,10 +29,12 @@ from hudepth.inference.runtimes import (
     package,
 )
 from hudepth.inference.trial import try_graph
-from hudepth.models.inference import inference_form
+from hudepth.models.inference import HalfForm, inference_form
 from hudepth.runs.checkpoint import Checkpoint
 
 BackendName = Literal["auto", "torch", "onnxruntime", "openvino"]
+Precision = Literal["float32", "float16", "bfloat16"]
+"""What a network computes in; depth is float32. Only float32 is exact."""
 EXPORTED = {".onnx": "onnxruntime", ".xml": "openvino", ".pt2": "torch"}  # and what can always read each
 PT2 = "pt2"  # what trust must contain to read a .pt2 file: PyTorch unpacks parts of it in a way that can run code
 
@@ -60,28 +66,53 @@ class DepthPipeline(nn.Module):
 
 
 class TorchBackend:
-    """A network in PyTorch; ``net`` maps a normalised image to unit depth, in the form in which it runs."""
+    """A network in PyTorch; ``net`` maps a normalised image to unit depth, in the form in which it runs.
+
+    On an NVIDIA GPU it is replayed as a CUDA graph, and float32 means without TF32, as on a CPU. A ``precision`` other
+    than float32 is for such a GPU; ``net`` is then changed in place.
+    """
 
     name = "torch"
 
-    def __init__(self, net: nn.Module, info: ModelInfo, *, device: torch.device) -> None:
-        self.info, self.device = info, device
-        self.pipeline = DepthPipeline(net, max_depth_m=info.max_depth_m).to(device)
+    def __init__(
+        self, net: nn.Module, info: ModelInfo, *, device: torch.device, precision: Precision = "float32"
+    ) -> None:
+        self.info, self.device, self.precision = info, device, precision
+        form = net if precision == "float32" else HalfForm(net, getattr(torch, precision))
+        self.pipeline = DepthPipeline(form, max_depth_m=info.max_depth_m).to(device)
+        wanted = graphs.has_graphs(device)
+        self._replayed = ArrayGraphs(self._exact, device, what="the network") if wanted else None
 
     def __call__(self, rgb: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
-        """Return depth [m] of RGB images at the model's size."""
-        with torch.inference_mode():
-            depth: Tensor = self.pipeline(torch.from_numpy(rgb).to(self.device))
-            return np.asarray(depth.cpu().numpy())
+        """Return depth [m] of RGB images at the model's size; raises CheckpointError if they overflow float16."""
+        if self._replayed is None:
+            with torch.inference_mode():
+                depth: Tensor = self.pipeline(torch.from_numpy(rgb).to(self.device))
+                return np.asarray(depth.cpu().numpy())
+        result = self._replayed(rgb)
+        if self.precision == "float16" and not np.isfinite(result).all():
+            raise CheckpointError(f"{self.info.name} exceeds the range of float16. Pass precision=bfloat16 or float32.")
+        return result
+
+    def _exact(self, rgb: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b h w"]:
+        with float32_products(tf32=False):
+            depth: Tensor = self.pipeline(rgb)
+            return depth
 
     @classmethod
     def of_checkpoint(
-        cls, checkpoint: Checkpoint, *, device: torch.device, trust: list[str], size: tuple[int, int] | None = None
+        cls,
+        checkpoint: Checkpoint,
+        *,
+        device: torch.device,
+        trust: list[str],
+        size: tuple[int, int] | None = None,
+        precision: Precision = "float32",
     ) -> TorchBackend:
-        """Return a checkpoint's network in its fastest exact form; raises HudepthError if it does not take the size."""
+        """Return a checkpoint's network in its fastest form; raises HudepthError if it does not take the size."""
         net = checkpoint.build_net(trust=trust)
         info = ModelInfo.of_checkpoint(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size)
-        return cls(inference_form(net.to(device), size=info.size), info, device=device)
+        return cls(inference_form(net.to(device), size=info.size), info, device=device, precision=precision)
 
 
 class GraphBackend:
@@ -137,8 +168,9 @@ def open_exported(
         backend = "openvino" if "openvino" in readers and importlib.util.find_spec("openvino") else usual
     if backend not in readers:
         raise ConfigError(f"backend={backend}: does not read '{path.name}'. Pass backend={' or '.join(readers)}.")
-    if precision != "float32" and backend != "openvino":
-        raise ConfigError(f"precision={precision}: needs backend=openvino and a .onnx or .xml file.")
+    if precision not in (OPENVINO_PRECISIONS if backend == "openvino" else ("float32",)):
+        how = "backend=openvino and a .onnx or .xml file, or " if precision in OPENVINO_PRECISIONS else ""
+        raise ConfigError(f"precision={precision}: needs {how}a checkpoint on an NVIDIA GPU.")
     if backend == "torch" and PT2 not in trust:
         fix = f"If you exported it yourself, pass trust=[{PT2}]; otherwise ask for an ONNX file or a bundle."
         raise CheckpointError(f"'{path}' is a program that could run any code when loaded. {fix}")

@@ -16,12 +16,12 @@ from PIL import Image
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.images import Photo, as_rgb, pillow_rgb, read_photo
 from hudepth.base.machine import torch_device, usable_cores
-from hudepth.base.options import Choice, Range, Size, parse
-from hudepth.inference.backends import EXPORTED, Backend, BackendName, TorchBackend, open_exported
+from hudepth.base.options import Range, Size, parse
+from hudepth.inference.backends import EXPORTED, Backend, BackendName, Precision, TorchBackend, open_exported
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.image_fit import Fit, Fitted, fit_image, unfit_depth
 from hudepth.inference.model_info import ModelInfo
-from hudepth.inference.runtimes import PRECISIONS
+from hudepth.inference.runtimes import OPENVINO_PRECISIONS
 from hudepth.runs.checkpoint import load_checkpoint
 
 Picture = str | Path | bytes | NDArray[Any] | torch.Tensor | Image.Image
@@ -117,7 +117,7 @@ class ModelOptions:
     runs: Path = Path("runs")
     backend: BackendName = "auto"
     device: str = "auto"
-    precision: Annotated[str, Choice(tuple(PRECISIONS))] = "float32"
+    precision: Precision = "float32"
     threads: Annotated[int, Range(1)] | None = None
     size: Size | None = None
     fit: Fit = "stretch"
@@ -145,7 +145,8 @@ def load(
             ``.onnx``, ``.xml`` or ``.pt2`` file, or ``last`` for the newest run.
         backend: what runs an exported file: ``onnxruntime``, ``openvino``, ``torch``, or ``auto``.
         device: ``cpu``, ``cuda``, ``mps``, or ``auto`` (a GPU if there is one); for checkpoints only.
-        precision: ``float32``, or ``bfloat16`` in OpenVINO, which is faster but not exact.
+        precision: ``float32``, or faster but not exact: ``bfloat16`` on an NVIDIA GPU or in OpenVINO, ``float16`` on an
+            NVIDIA GPU.
         threads: to compute with on a CPU; default: the cores this process may use.
         size: (height, width) of the network's input; default: that of its training. Exported files have a fixed one.
         fit: ``stretch`` or ``letterbox``.
@@ -177,13 +178,17 @@ def load_model(chosen: ModelOptions) -> DepthModel:
             path, backend=chosen.backend, threads=threads, trust=chosen.trust, precision=chosen.precision
         )
         return DepthModel(graph, fit=chosen.fit, flip=chosen.flip)
-    for key, usable in (("backend", ("auto", "torch")), ("precision", ("float32",))):
-        if (value := getattr(chosen, key)) not in usable:
-            run = f"hudepth-export checkpoint={chosen.checkpoint} format=openvino"
-            raise ConfigError(f"{key}={value}: needs an exported file. Run {run} first.")
+    export = f"hudepth-export checkpoint={chosen.checkpoint} format=openvino"
+    if chosen.backend not in ("auto", "torch"):
+        raise ConfigError(f"backend={chosen.backend}: needs an exported file. Run {export} first.")
     device = torch_device(chosen.device)
+    if chosen.precision != "float32" and device.type != "cuda":
+        also = f", or run {export} first" if chosen.precision in OPENVINO_PRECISIONS else ""
+        raise ConfigError(f"precision={chosen.precision}: needs an NVIDIA GPU. Pass precision=float32{also}.")
     if device.type == "cpu":
         torch.set_num_threads(threads)
     checkpoint = load_checkpoint(chosen.checkpoint, runs=chosen.runs)
-    backend = TorchBackend.of_checkpoint(checkpoint, device=device, trust=chosen.trust, size=chosen.size)
+    backend = TorchBackend.of_checkpoint(
+        checkpoint, device=device, trust=chosen.trust, size=chosen.size, precision=chosen.precision
+    )
     return DepthModel(backend, fit=chosen.fit, flip=chosen.flip)

@@ -9,7 +9,7 @@ from typing import Any
 from hudepth.base.errors import ConfigError
 
 KEY = "hudepth"  # under which exported files carry the description of their model, as JSON
-PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}  # and OpenVINO's names for them; bfloat16 is not exact
+OPENVINO_PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}  # and its names for them; bfloat16 is not exact
 
 
 def onnx_session(path: Path, *, threads: int) -> Any:
@@ -24,7 +24,7 @@ def onnx_session(path: Path, *, threads: int) -> Any:
 def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:
     """Open an IR or ONNX file in OpenVINO: the model as read, and an inference request; raises as onnx_session does."""
     core = package("openvino", extra="openvino").Core()
-    options = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision], "INFERENCE_NUM_THREADS": threads}
+    options = {"INFERENCE_PRECISION_HINT": OPENVINO_PRECISIONS[precision], "INFERENCE_NUM_THREADS": threads}
     options["PERFORMANCE_HINT"] = "LATENCY"
     model = core.read_model(path)
     return model, core.compile_model(model, "CPU", options).create_infer_request()

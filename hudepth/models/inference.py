@@ -18,6 +18,7 @@ from hudepth.base.console import log
 from hudepth.base.machine import float32_products
 from hudepth.base.masked import widen
 from hudepth.models.decoder import Head, UpBlock, split_kernel
+from hudepth.models.unet import UNet
 
 TOLERANCE = 1e-5
 """Largest difference in unit depth from the original network; 0.1 mm at a maximum depth of 10 m."""
@@ -44,6 +45,30 @@ def inference_form(net: nn.Module, *, size: tuple[int, int]) -> nn.Module:
         log.debug("%s: not rewritten, its output would change by %g", type(net).__name__, difference)
         return plain
     return fused
+
+
+class HalfForm(nn.Module):
+    """A network that computes in half precision, from and to float32; ``net`` is changed in place.
+
+    The head and the output of a UNet stay float32: they are little work, and their roundings are the largest. With
+    bfloat16, that nearly halves the mean error.
+    """
+
+    def __init__(self, net: nn.Module, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.net, self.dtype = net, dtype
+        if isinstance(net, UNet):
+            for child in net.children():
+                if child is not net.head and child is not net.output:
+                    child.to(dtype)
+            net.head.register_forward_pre_hook(lambda _, inputs: (inputs[0].float(),))
+        else:
+            net.to(dtype)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Return unit depth."""
+        unit_depth: Tensor = self.net(image.to(self.dtype)).float()
+        return unit_depth
 
 
 def fold_batch_norm(net: nn.Module) -> None:

@@ -195,6 +195,7 @@ def test_choices_that_do_not_fit(exported: Path, trained: Path) -> None:
         ("model.onnx", {"backend": "onxruntime"}, "backend: .* 'onnxruntime'"),
         ("model.onnx", {"size": (64, 64)}, "size: "),
         ("model.onnx", {"backend": "onnxruntime", "precision": "bfloat16"}, "precision=bfloat16: .*openvino"),
+        ("model.onnx", {"backend": "openvino", "precision": "float16"}, "precision=float16: needs a checkpoint on"),
         ("nowhere.onnx", {}, "checkpoint: no file"),
     ):
         with pytest.raises(ConfigError, match=message):

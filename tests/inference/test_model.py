@@ -10,8 +10,11 @@ from PIL import Image
 
 import hudepth
 from hudepth.base.errors import CheckpointError, ConfigError, DataError
+from hudepth.inference.backends import TorchBackend
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
+from hudepth.runs.checkpoint import load_checkpoint
+from tests.devices import with_graphs
 
 
 class Columns:
@@ -102,3 +105,46 @@ def test_what_is_trusted_is_one_name_or_several(trust: Iterable[str], tmp_path: 
         hudepth.load(tmp_path / "x.pt2")
     with pytest.raises(CheckpointError, match="cannot be read"):
         hudepth.load(tmp_path / "x.pt2", trust=trust)
+
+
+@pytest.mark.parametrize(("precision", "most_m"), [("float32", 0.0), ("float16", 0.05), ("bfloat16", 0.4)])
+def test_on_a_gpu_the_network_is_replayed(tiny: Path, precision: str, most_m: float) -> None:
+    pictures = list(np.random.default_rng(0).integers(0, 256, (7, 48, 64, 3), np.uint8))
+    usual = hudepth.load(tiny, device="cpu").predict_many(pictures, batch_size=2)
+    calls: list[None] = []
+    with with_graphs():
+        model = on_stand_in(tiny, precision)
+        model.backend.pipeline.register_forward_pre_hook(lambda *_: calls.append(None))  # type: ignore[attr-defined]
+        for _ in range(4):
+            predicted = model.predict_many(pictures, batch_size=2)
+    assert len(calls) == 4 + 4  # of the 16: three as usual and one recorded, for two shapes
+    for one, other in zip(usual, predicted, strict=True):
+        assert np.abs(one.metres - other.metres).max() <= most_m
+        assert other.metres.dtype == np.float32
+
+
+def on_stand_in(path: Path, precision: str) -> DepthModel:
+    checkpoint = load_checkpoint(str(path), runs="runs")
+    backend = TorchBackend.of_checkpoint(checkpoint, device=torch.device("cpu"), trust=[], precision=precision)  # type: ignore[arg-type]
+    return DepthModel(backend)
+
+
+def test_numbers_that_float16_cannot_hold_name_the_fix(tiny: Path) -> None:
+    with with_graphs():
+        model = on_stand_in(tiny, "float16")
+        with torch.no_grad():
+            model.backend.pipeline.net.net.encode.weight.fill_(60_000)  # type: ignore[attr-defined]
+            model.backend.pipeline.net.net.encode.weight[1::2] *= -1  # type: ignore[attr-defined]
+        with pytest.raises(CheckpointError, match=r"float16\. Pass precision=bfloat16"):
+            model.predict(np.full((32, 48, 3), 255, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("precision", "fix"),
+    [("float16", r"Pass precision=float32\."), ("bfloat16", r"precision=float32, or run hudepth-export checkpoint=")],
+)
+def test_half_precision_needs_a_gpu(tiny: Path, precision: str, fix: str) -> None:
+    with pytest.raises(ConfigError, match=f"^precision={precision}: needs an NVIDIA GPU. .*{fix}"):
+        hudepth.load(tiny, device="cpu", precision=precision)
+    with pytest.raises(ConfigError, match=r"^precision: 'half' is not"):
+        hudepth.load(tiny, device="cpu", precision="half")

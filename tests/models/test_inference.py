@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import pytest
 import torch
 from hypothesis import given
@@ -11,7 +14,7 @@ from torch.nn import functional
 
 from hudepth.models import HybridUNet, ResNet18UNet, TinyUNet
 from hudepth.models.decoder import Head, UpBlock
-from hudepth.models.inference import TOLERANCE, MergedHead, MergedUpBlock, fold_batch_norm, inference_form
+from hudepth.models.inference import TOLERANCE, HalfForm, MergedHead, MergedUpBlock, fold_batch_norm, inference_form
 
 
 def lived_in(net: nn.Module, seed: int = 0) -> nn.Module:
@@ -97,3 +100,27 @@ def test_a_network_that_cannot_be_rewritten_stays_as_it_is() -> None:
     image = torch.randn(1, 3, 16, 32)
     assert (same(image) - net(image)).abs().max() <= TOLERANCE
     assert any(isinstance(module, nn.BatchNorm2d) for module in same.modules())
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(torch.bfloat16, 2**-6), (torch.float16, 2**-9)])
+@pytest.mark.parametrize(
+    "make",
+    [HybridUNet, partial(HybridUNet, output="bins", attention_positions="sine"), TinyUNet],
+    ids=["hybrid", "bins-sine", "tiny"],
+)
+def test_half_precision_costs_only_its_roundings(
+    make: Callable[[], nn.Module], dtype: torch.dtype, most: float
+) -> None:
+    torch.manual_seed(0)
+    net = inference_form(lived_in(make()), size=(32, 48))
+    image = torch.randn(2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        expected = net(image)
+        half = HalfForm(net, dtype)
+        found = half(image)
+    assert found.dtype == torch.float32
+    assert 0 < (found - expected).abs().max() < most
+    kinds = {name: parameter.dtype for name, parameter in half.net.named_parameters()}
+    last = [name for name in kinds if name.startswith(("head", "output"))]
+    assert {kinds[name] for name in kinds if name not in last} == {dtype}
+    assert {kinds[name] for name in last} <= {torch.float32}
