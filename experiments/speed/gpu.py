@@ -16,11 +16,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -66,13 +66,12 @@ class Report:
         print(f"{what}: {value:.4g} {unit}".rstrip() + (f" (bar {bar})" if bar else ""), flush=True)
         return value
 
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """Go on with the next part if this one fails."""
+    def part(self, name: str, measure: Callable[[], None]) -> None:
+        """Measure, and go on with the next part if this one fails or there is no time left."""
         try:
             if time.monotonic() > self.deadline:
                 raise TimeoutError("no time left")
-            yield
+            measure()
         except Exception as error:  # one failing part should not cost the others
             lines = str(error).strip().splitlines() or [""]
             self.missing.append(f"{name}: {type(error).__name__} {lines[-1]}"[:200])
@@ -164,42 +163,56 @@ def rate(function: Callable[[], Any], images: int, *, seconds: float = 2.0) -> f
     return calls * images / (time.perf_counter() - start)
 
 
-def measure_training(report: Report, folder: Path, device: torch.device, *, size: int, scenes: int) -> None:
-    """Compare hudepth-train with bare loops."""
-    quiet = ("callbacks.panels=0", "trainer.limit_val_batches=0", "logger=none", "monitor=train/loss/total")
-    cuda = device.type == "cuda"
-    real: dict[int, Epochs] = {}
-    for batch in (8, 64) if cuda else (8,):
-        with report.part(f"badcl, batch {batch}"):
-            real[batch] = train(folder, "badcl", size=size, batch=batch, scenes=scenes, more=quiet)
-            got = report.add(f"badcl, batch {batch}", real[batch].images_per_s, unit="images/s")
-            with float32_products(tf32=cuda):
-                step = bare_step("badcl", size=size, batch=batch, device=device, bf16=False)
-                eager = report.add(f"bare eager loop, batch {batch}", rate(step, batch), unit="images/s")
-                report.add(f"badcl over the bare eager loop, batch {batch}", got / eager, ">= 3" if batch == 8 else "")
-                if cuda:
-                    graph = report.add(f"bare CUDA graph, batch {batch}", rate(recorded(step), batch), unit="images/s")
-                    report.add(f"badcl over the bare CUDA graph, batch {batch}", got / graph, f">= {_SHARE[batch]}")
-    with report.part("strong over badcl"):
-        strong = train(folder, "strong", size=size, batch=8, scenes=scenes, more=(*quiet, "trainer.precision=tf32"))
-        report.add("strong over badcl, batch 8", strong.images_per_s / real[8].images_per_s, ">= 0.85")
-    with report.part("the paper's training"):
-        whole = train(folder, "badcl", size=size, batch=8, scenes=scenes)
-        report.add("badcl, batch 8, with validation and pictures", whole.images_per_s, unit="images/s")
-        validated = max(1, scenes * 8 // 10)
-        per_epoch = PAPER_IMAGES / real[8].images_per_s
-        per_epoch += (whole.seconds - real[8].seconds) * max(1.0, PAPER_VALIDATION / validated)
-        if cuda:
-            report.add("the paper's training", PAPER_EPOCHS * per_epoch / 60, "< 30", "minutes")
-    if cuda:
-        with report.part("share of the peak"):
-            bf16 = train(folder, "badcl", size=size, batch=128, scenes=scenes, more=(*quiet, "trainer.precision=fast"))
-            flops = 3 * network_flops(size)  # a backward pass takes two forward passes
-            report.add("share of the bf16 peak in training, batch 128",
-                       100 * bf16.images_per_s * flops / peak_flops(device), ">= 12", "%")  # fmt: skip
+class Training:
+    """Compares hudepth-train with bare loops."""
 
+    QUIET = ("callbacks.panels=0", "trainer.limit_val_batches=0", "logger=none", "monitor=train/loss/total")
+    SHARE: ClassVar = {8: 0.75, 64: 0.95}
 
-_SHARE = {8: 0.75, 64: 0.95}
+    def __init__(self, report: Report, folder: Path, device: torch.device, *, size: int, scenes: int) -> None:
+        self.report, self.device, self.size, self.scenes = report, device, size, scenes
+        self.train = partial(train, folder, size=size, scenes=scenes)
+        self.cuda = device.type == "cuda"
+        self.real: dict[int, Epochs] = {}
+
+    def measure(self) -> None:
+        for batch in (8, 64) if self.cuda else (8,):
+            self.report.part(f"badcl, batch {batch}", partial(self.badcl, batch))
+        self.report.part("strong over badcl", self.strong)
+        self.report.part("the paper's training", self.paper)
+        if self.cuda:
+            self.report.part("share of the bf16 peak", self.share)
+
+    def badcl(self, batch: int) -> None:
+        add = self.report.add
+        self.real[batch] = self.train("badcl", batch=batch, more=self.QUIET)
+        got = add(f"badcl, batch {batch}", self.real[batch].images_per_s, unit="images/s")
+        with float32_products(tf32=self.cuda):
+            step = bare_step("badcl", size=self.size, batch=batch, device=self.device, bf16=False)
+            eager = add(f"bare eager loop, batch {batch}", rate(step, batch), unit="images/s")
+            add(f"badcl over the bare eager loop, batch {batch}", got / eager, ">= 3" if batch == 8 else "")
+            if self.cuda:
+                graph = add(f"bare CUDA graph, batch {batch}", rate(recorded(step), batch), unit="images/s")
+                add(f"badcl over the bare CUDA graph, batch {batch}", got / graph, f">= {self.SHARE[batch]}")
+
+    def strong(self) -> None:
+        found = self.train("strong", batch=8, more=(*self.QUIET, "trainer.precision=tf32"))
+        self.report.add("strong over badcl, batch 8", found.images_per_s / self.real[8].images_per_s, ">= 0.85")
+
+    def paper(self) -> None:
+        whole = self.train("badcl", batch=8, more=())
+        self.report.add("badcl, batch 8, with validation and pictures", whole.images_per_s, unit="images/s")
+        validated = max(1, self.scenes * 8 // 10)
+        evaluation = (whole.seconds - self.real[8].seconds) * max(1.0, PAPER_VALIDATION / validated)
+        if self.cuda:
+            minutes = PAPER_EPOCHS * (PAPER_IMAGES / self.real[8].images_per_s + evaluation) / 60
+            self.report.add("the paper's training", minutes, "< 30", "minutes")
+
+    def share(self) -> None:
+        found = self.train("badcl", batch=128, more=(*self.QUIET, "trainer.precision=fast"))
+        flops = 3 * network_flops(self.size)  # a backward pass takes two forward passes
+        percent = 100 * found.images_per_s * flops / peak_flops(self.device)
+        self.report.add("share of the bf16 peak in training, batch 128", percent, ">= 12", "%")
 
 
 def network_flops(size: int) -> float:
@@ -218,17 +231,19 @@ def peak_flops(device: torch.device) -> float:
 def measure_inference(report: Report, folder: Path, device: torch.device) -> None:
     """Compare hudepth.load with a bare CUDA graph, and hudepth-bench with table 3."""
     for batch in (1, 32):
-        with report.part(f"inference, batch {batch}"):
-            measure_load(report, device, batch)
-    with report.part("hudepth-bench"):
-        backends = "[eager,default,cuda_graph,fp16,bf16]" if device.type == "cuda" else "[eager,default]"
-        command(
-            "hudepth-bench", "checkpoint=nyu", f"device={device.type}", f"backends={backends}", "batches=[1,32]",
-            "repeats=2", "seconds=0.3", f"output={folder / 'bench'}", cwd=folder,
-        )  # fmt: skip
-        for row in json.loads((folder / "bench" / "bench.json").read_text())["rows"]:
-            name = f"hudepth-bench, {row['contender']}, batch {row['batch']} (the paper: {PAPER_RATES[row['batch']]})"
-            report.add(name, row["images_per_s"], unit="images/s")
+        report.part(f"inference, batch {batch}", partial(measure_load, report, device, batch))
+    report.part("hudepth-bench", partial(measure_bench, report, folder, device))
+
+
+def measure_bench(report: Report, folder: Path, device: torch.device) -> None:
+    backends = "[eager,default,cuda_graph,fp16,bf16]" if device.type == "cuda" else "[eager,default]"
+    command(
+        "hudepth-bench", "checkpoint=nyu", f"device={device.type}", f"backends={backends}", "batches=[1,32]",
+        "repeats=2", "seconds=0.3", f"output={folder / 'bench'}", cwd=folder,
+    )  # fmt: skip
+    for row in json.loads((folder / "bench" / "bench.json").read_text())["rows"]:
+        name = f"hudepth-bench, {row['contender']}, batch {row['batch']} (the paper: {PAPER_RATES[row['batch']]})"
+        report.add(name, row["images_per_s"], unit="images/s")
 
 
 def measure_load(report: Report, device: torch.device, batch: int) -> None:
@@ -246,10 +261,13 @@ def measure_load(report: Report, device: torch.device, batch: int) -> None:
 
 def measure_host(report: Report) -> None:
     """Measure what the host pays for a step, which needs no GPU."""
+
+    def measure(experiment: str, bar: str) -> None:
+        extra = step_overhead.measure(experiment, steps=100, pairs=3)
+        report.add(f"host time of a step of {experiment} beyond the bare step", extra, bar, "ms")
+
     for experiment, bar in (("badcl", "<= 1.5"), ("strong", "<= 4")):
-        with report.part(f"host time of {experiment}"):
-            extra = step_overhead.measure(experiment, steps=100, pairs=3)
-            report.add(f"host time of a step of {experiment} beyond the bare step", extra, bar, "ms")
+        report.part(f"host time of {experiment}", partial(measure, experiment, bar))
 
 
 NEEDS_GPU = (
@@ -276,7 +294,7 @@ def main() -> None:
         flush=True,
     )
     with tempfile.TemporaryDirectory() as folder:
-        measure_training(report, Path(folder), device, size=size, scenes=scenes)
+        Training(report, Path(folder), device, size=size, scenes=scenes).measure()
         measure_inference(report, Path(folder), device)
     measure_host(report)
     if not cuda:

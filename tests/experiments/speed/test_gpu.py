@@ -31,7 +31,10 @@ def test_rows_without_a_gpu_have_bars_only_for_the_host(capsys: pytest.CaptureFi
     report.add("rate", 12.0, ">= 3")
     report.add("host time", 2.0, "<= 4", "ms")
     assert [row.bar for row in report.rows] == ["", "<= 4"]
-    with report.part("broken"):
+
+    def broken() -> None:
         raise RuntimeError("first\nlast line")
+
+    report.part("broken", broken)
     assert report.missing == ["broken: RuntimeError last line"]
     assert "host time: 2 ms (bar <= 4)" in capsys.readouterr().out
