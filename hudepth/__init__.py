@@ -21,7 +21,8 @@ def load(spec: Any, **options: Any) -> DepthModel:
 
     Args:
         spec: a checkpoint, run directory, bundle, exported file, or ``last`` for the newest run.
-        **options: ``backend``, ``device``, ``precision``, ``threads``, ``size``, ``fit``, ``trust``, ``runs``.
+        **options: ``backend``, ``device``, ``precision``, ``threads``, ``size``, ``fit``, ``flip``, ``camera``,
+            ``trust``, ``runs``.
 
     Raises:
         HudepthError: with one line that states the fix.

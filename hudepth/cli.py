@@ -22,9 +22,9 @@ ADDED_GROUPS = ("experiment", "sweep")
 PATHS = {
     "input", "output", "checkpoint", "resume", "init", "run", "runs", "dir", "a", "b", "name", "images", "sweep_dir",
     "model.weights", "distill.teacher", "data.root", "data.cache", "data.teacher", "data.source.images",
-    "data.source.depths", "data.source.manifest", "paths.runs", "paths.sweeps", "paths.cache",
+    "data.source.depths", "data.source.manifest", "paths.runs", "paths.sweeps", "paths.cache", "camera",
 }  # fmt: skip
-"""Options that are paths or names: their values are text, whatever Hydra's grammar would make of them."""
+"""Options that are paths, names or a camera (``fov=62``): text, whatever Hydra's grammar would make of it."""
 
 _WORD = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_][\w./-]{0,99}", re.IGNORECASE)
 """A choice of a group: nothing that Hydra reads as a number or a constant."""

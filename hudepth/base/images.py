@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import struct
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +26,8 @@ from PIL import (
     features,
 )
 
+from hudepth.base.camera.exif import directory, exif_camera, orientation
+from hudepth.base.camera.intrinsics import Intrinsics
 from hudepth.base.errors import DataError
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it cannot read becomes an error of one line
@@ -45,9 +46,7 @@ MAX_NATIVE_PIXELS = 25_000_000
 """Of a ground truth that is scored, which takes some 50 bytes a pixel. The largest public ones have 24 million."""
 MAX_PIXELS = 100_000_000
 """Larger images are refused before they are decoded."""
-_ORIENTATION = 0x0112  # a tag of EXIF
 _MAX_EXIF = 1 << 20  # bytes; a segment of a JPEG holds 65,533
-_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}  # bytes by type
 _TURNS = {  # by orientation: what brings it upright
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
     5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
@@ -64,6 +63,8 @@ class Photo(NamedTuple):
     """Upright RGB."""
     notes: tuple[str, ...]
     """What was done to it that its owner may want to know."""
+    camera: Intrinsics | str = ""
+    """The camera that its EXIF states, or why it states none; empty if it says nothing of one."""
 
 
 def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int = MAX_PIXELS) -> Photo:
@@ -90,7 +91,8 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
             check_pixels(image.height, image.width, where=where, most=max_pixels)
             notes = _notes(image)
             image.load()
-            turn = _TURNS.get(_orientation(image))
+            exif = data if image.format == "TIFF" else bytes(image.info.get("exif", b"")).removeprefix(b"Exif\0\0")
+            turn = _TURNS.get(orientation(exif))
             rgb = pillow_rgb(image if turn is None else image.transpose(turn), where=where)
     except DataError:
         raise
@@ -102,7 +104,7 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
     except Exception as error:  # decoders know dozens of ways in which a file can be broken
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DataError(f"{where}: cannot be decoded, the file is truncated or damaged ({reason}).") from None
-    return Photo(rgb, notes)
+    return Photo(rgb, notes, exif_camera(exif, rgb.shape[0], rgb.shape[1]))
 
 
 def _notes(image: Image.Image) -> tuple[str, ...]:
@@ -132,15 +134,9 @@ def _check_tags(data: bytes, where: str) -> None:
     jpeg = _jpeg_exif(data) if data[:2] == b"\xff\xd8" else b""
     starts = [m.start() for m in islice(re.finditer(rb"II\*\0|MM\0\*", data), 9)] if data[4:8] == b"ftyp" else [0]
     blocks = [memoryview(jpeg or data)[at:] for at in starts]  # of an AVIF, from where its EXIF may begin
-    overlap = any(sum(min(size, len(each)) for size, _ in _tags(each).values()) > 4 * len(each) for each in blocks)
+    overlap = any(sum(min(tag.size, len(each)) for tag in directory(each).values()) > 4 * len(each) for each in blocks)
     if overlap or len(jpeg) > _MAX_EXIF or len(blocks) > 8:
         raise DataError(f"{where}: its tags (EXIF) overlap or are too many. Save the picture again without them.")
-
-
-def _orientation(image: Image.Image) -> Any:
-    if image.format == "TIFF":
-        return getattr(image, "tag_v2", {}).get(_ORIENTATION, 1)
-    return _tags(bytes(image.info.get("exif", b"")).removeprefix(b"Exif\0\0")).get(_ORIENTATION, (0, 1))[1]
 
 
 def _jpeg_exif(data: bytes) -> bytes:
@@ -152,25 +148,6 @@ def _jpeg_exif(data: bytes) -> bytes:
             parts.append(data[at + 10 : at + 2 + length])
         at += 2 + length
     return b"".join(parts)
-
-
-def _tags(block: bytes | memoryview) -> dict[int, tuple[int, int]]:
-    """Return size and first number of each tag of the first directory of a TIFF structure; empty if it is none."""
-    order = {b"II": "<", b"MM": ">"}.get(bytes(block[:2]))
-    if order is None or len(block) < 16:
-        return {}
-    big = block[2:4] in (b"+\0", b"\0+")  # BigTIFF
-    start = struct.unpack_from(f"{order}Q" if big else f"{order}I", block, 8 if big else 4)[0]
-    head, entry = (f"{order}Q", f"{order}HHQ8s") if big else (f"{order}H", f"{order}HHI4s")
-    if start + struct.calcsize(head) > len(block):
-        return {}
-    (count,) = struct.unpack_from(head, block, start)
-    at, tags = start + struct.calcsize(head), {}
-    for _ in range(min(count, (len(block) - at) // struct.calcsize(entry))):
-        tag, kind, length, value = struct.unpack_from(entry, block, at)
-        tags[tag] = (_SIZES.get(kind, 1) * length, struct.unpack_from(f"{order}H", value)[0] if kind == 3 else 0)
-        at += struct.calcsize(entry)
-    return tags
 
 
 def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.base.camera import Intrinsics
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.images import read_photo, resize_image
 from hudepth.data.store import to_mm
@@ -38,37 +37,35 @@ class Answer:
     name: str  # of the picture's file, without its ending
     depth: DepthMap
     shown: DepthMap  # the same, with sides of at most MAX_SIDE; its pixels are picked from depth, not averaged
-    camera: Intrinsics  # in pixels of ``shown``
     payload: dict[str, Any]  # input of the page's script
 
 
-def answer(path: Path, model: DepthModel, limits: Limits, intrinsics: Intrinsics | None = None) -> Answer:
+def answer(path: Path, model: DepthModel, limits: Limits) -> Answer:
     """Predict the depth of an uploaded picture; raises DataError with one line for the visitor.
 
-    ``intrinsics`` are those of the camera, in pixels of the picture; None stands for NYU's, scaled.
+    Where the model's camera cannot have taken it, that of the training images stands in, and the caption says so.
     """
     start = time.perf_counter()
     data = _read_upload(path, limits.upload_bytes)
     photo = read_photo(data, where=f"'{path.name}'", max_pixels=limits.pixels)
-    depth = replace(model.predict(photo.rgb), notes=photo.notes)
-    shown = reduce_depth(depth)
-    (height, width), (rows, columns) = depth.metres.shape, shown.metres.shape
     try:
-        (intrinsics or Intrinsics.of_photo(height, width)).check_fit(height, width)
+        depth = model.predict(photo)
     except ConfigError:
-        note = "intrinsics= are not of a picture of this size, NYU's stand in for them"
-        intrinsics, depth = None, replace(depth, notes=(*depth.notes, note))
-    camera = (intrinsics or Intrinsics.of_photo(height, width)).scale(columns / width, rows / height)
+        note = "camera= is not of a picture of this size"
+        depth = model.predict(photo._replace(notes=(*photo.notes, note)), camera="training")
+    shown = reduce_depth(depth)
+    rows, columns = shown.metres.shape
+    assert shown.camera is not None
     payload = {
         "width": columns,
         "height": rows,
         "depth_mm": base64.b64encode(to_mm(shown.metres).astype("<u2").tobytes()).decode(),
         "photo": f"data:image/jpeg;base64,{base64.b64encode(jpeg(shown.image, quality=88)).decode()}",
         "max_depth_m": depth.max_depth_m,
-        "camera": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "camera": list(shown.camera.numbers),
         "caption": _caption(path.name, depth, seconds=time.perf_counter() - start),
     }
-    return Answer(path.stem[:80], depth, shown, camera, payload)
+    return Answer(path.stem[:80], depth, shown, payload)
 
 
 def _read_upload(path: Path, max_bytes: int) -> bytes:
@@ -92,7 +89,8 @@ def reduce_depth(depth: DepthMap, max_side: int = MAX_SIDE) -> DepthMap:
     pairs = zip((rows, columns), shape, strict=True)
     centres = [((np.arange(n) + 0.5) * (length / n)).astype(np.intp) for n, length in pairs]
     image = resize_image(depth.image, (rows, columns))
-    return DepthMap(depth.metres[np.ix_(*centres)], image, depth.max_depth_m, depth.notes)
+    camera = depth.camera and depth.camera.scale(columns / shape[1], rows / shape[0])
+    return replace(depth, metres=depth.metres[np.ix_(*centres)], image=image, camera=camera)
 
 
 def colour_table() -> UInt8[np.ndarray, "256 3"]:
@@ -106,4 +104,6 @@ def _caption(name: str, depth: DepthMap, *, seconds: float) -> str:
     height, width = depth.metres.shape
     near, middle, far = (float(np.quantile(depth.metres[::4, ::4], q)) for q in (0.01, 0.5, 0.99))
     depths = f"{near:.2f} to {far:.2f} m, median {middle:.2f} m"
-    return "; ".join([f"{name}, {width} x {height}", depths, f"{seconds:.2f} s", *depth.notes])
+    return "; ".join(
+        [f"{name}, {width} x {height}", depths, f"{seconds:.2f} s", f"camera: {depth.whose_camera}", *depth.notes]
+    )

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from hudepth.base.camera import CameraOption, Intrinsics
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError
 from hudepth.base.images import MAX_PIXELS
@@ -30,7 +29,6 @@ class DemoOptions(ModelOptions):
     max_pixels: Annotated[int, Range(1, MAX_PIXELS)] = 40_000_000
     max_kept_mb: Annotated[float, Range(0, 2**20, above=True)] = 200
     allowed_hosts: list[str] = field(default_factory=list)
-    intrinsics: CameraOption | None = None
 
 
 def demo(config: dict[str, Any]) -> None:
@@ -38,7 +36,6 @@ def demo(config: dict[str, Any]) -> None:
     if importlib.util.find_spec("gradio") is None:
         raise ConfigError("gradio is not installed. Run pip install 'hudepth[demo]'.")
     options = parse(DemoOptions, {**config, "runs": config["paths"]["runs"]})
-    camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
     hosts = host_names(options.allowed_hosts)
     upload, kept = (int(megabytes * 2**20) for megabytes in (options.max_upload_mb, options.max_kept_mb))
     limits = Limits(upload, options.max_pixels, kept)
@@ -46,8 +43,14 @@ def demo(config: dict[str, Any]) -> None:
     model = load_model(options)
     model.predict(np.zeros((*model.info.size, 3), np.uint8))  # the first run is slow; visitors should not wait for it
     serve(
-        partial(answer, model=model, limits=limits, intrinsics=camera),
+        partial(answer, model=model, limits=limits),
         host=options.host, port=options.port, limits=limits, info=model.info, allowed_hosts=hosts,
         ready=partial(log.info, "model: %s; open %s (Ctrl-C stops)", model.info),
-        camera="as given" if camera else "NYU Depth V2's, since intrinsics= is not set",
+        camera=_camera_words(options.camera),
     )  # fmt: skip
+
+
+def _camera_words(camera: str | tuple[float, ...]) -> str:
+    if camera == "auto":
+        return "as each picture's EXIF states, else that of the training images"
+    return "that of the training images" if camera == "training" else f"as given, {camera}"

@@ -96,7 +96,7 @@ def headline(info: ModelInfo, camera: str) -> str:
     """Return the headline: which model this is, and how far to trust its numbers."""
     return (
         '<div class="hd-head"><h1>Depth from one picture</h1><p>'
-        f"{escape(str(info))}. Camera of the point cloud: {escape(camera)}. "
+        f"{escape(str(info))}. Camera: {escape(camera)}. "
         "Do not trust the metres in pictures unlike the training data.</p></div>"
     )
 

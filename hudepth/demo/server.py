@@ -66,7 +66,7 @@ def serve(
         port: to listen on; 0 takes a free one.
         limits: the largest picture that is accepted.
         info: of the model.
-        camera: whose intrinsics the point cloud uses, in words.
+        camera: which is meant to have taken the pictures, in words.
         ready: called with the page's address once it responds.
         allowed_hosts: names by which requests may call this machine, besides ``localhost`` and its address.
     """

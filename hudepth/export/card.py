@@ -156,6 +156,7 @@ def _limits(info: ModelInfo, source: str) -> str:
         f"- Trained on scenes like those of `{source}`. Elsewhere (outdoors, other cameras, other heights) its metres "
         "are guesses: a single image does not determine scale.\n"
         f"- It predicts nothing beyond {info.max_depth_m:g} m.\n"
-        "- Images are resized to the input size as in training; a different field of view shifts all distances.\n"
+        "- Images are resized to the input size as in training; another field of view shifts all distances, unless\n"
+        "  `camera=` of `hudepth-predict` or the file's EXIF states it.\n"
         "- Errors are largest at mirrors, glass, thin objects and edges. Do not steer or brake by it."
     )

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from hudepth import __version__
 from hudepth.base.files import written_whole
 from hudepth.inference.backends import DepthPipeline
+from hudepth.inference.image_fit import FOCAL_POWERS
 from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import KEY, package
 
@@ -50,10 +51,20 @@ def describe(info: ModelInfo) -> dict[str, str]:
         "resize": f"{averaged}, else bilinear; another method shifts depth by centimetres",
         "input": f"{INPUT}: {image}",
         "output": f"{OUTPUTS[info.processing]}: {depth}",
+        **_describe_camera(info),
         "max_depth_m": f"{info.max_depth_m:g}",
         "trained_on": json.dumps(info.trained_on, sort_keys=True),
         "producer": f"hudepth {__version__}",
     }
+
+
+def _describe_camera(info: ModelInfo) -> dict[str, str]:
+    """Return what a picture of another camera than that of the training needs; nothing if that is not known."""
+    if info.training_focal is None:
+        return {}
+    (across, down), (x, y) = info.training_focal, FOCAL_POWERS
+    ratios = f"(fx / width / {across:.4f})^{x:g} (fy / height / {down:.4f})^{y:g}"
+    return {"camera": f"for pictures of focal lengths fx, fy [pixels], multiply depth by {ratios}"}
 
 
 def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:

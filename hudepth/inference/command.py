@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import time
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
@@ -12,7 +13,6 @@ from typing import Annotated, Any
 
 import cv2
 
-from hudepth.base.camera import CameraOption, Intrinsics
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import output_folder, write_json
@@ -41,7 +41,6 @@ class PredictOptions(ModelOptions):
     formats: list[Annotated[str, Choice(tuple(FORMATS))]] | None = None
     recursive: bool = False
     scale_m: Annotated[tuple[float, float], "two rising distances [near,far] in metres"] | None = None
-    intrinsics: CameraOption | None = None
     smoothing: Annotated[float, Range(0, 1, below=True)] = 0.0
     frames: Annotated[int, Range(1)] | None = None
     batch_size: Annotated[int, Range(1)] | None = None
@@ -61,12 +60,19 @@ class Job:
     style: Style
     options: PredictOptions
     tally: Tally = field(default_factory=Tally)
+    cameras: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By input, the camera it was predicted for; that of the first frame for a video."""
+
+    def note_camera(self, name: str, depth: DepthMap) -> None:
+        """Record which camera an input was predicted for."""
+        if name not in self.cameras and depth.camera is not None:
+            camera = {"intrinsics": list(depth.camera.numbers), "origin": depth.camera.origin}
+            self.cameras[name] = {**camera, "known": depth.camera.known, "depth_factor": depth.camera_factor}
 
 
 def predict(config: dict[str, Any]) -> None:
     """Predict all inputs of conf/predict.yaml; raises HudepthError, for unreadable inputs once all others are done."""
     options = parse(PredictOptions, {**config, "runs": config["paths"]["runs"]})
-    camera = Intrinsics(*options.intrinsics) if options.intrinsics else None
     inputs = find_inputs(options.input, recursive=options.recursive, output=Path(options.output).expanduser())
     output = output_folder(options.output)
     for line in inputs.left_out:
@@ -76,7 +82,7 @@ def predict(config: dict[str, Any]) -> None:
     model = load_model(options)
     log.info("model: %s; %s, fit=%s", model.info, model.backend.name, model.fit)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
-    job = Job(model, output, Style(options.scale_m or (0.0, model.info.max_depth_m), camera), options)
+    job = Job(model, output, Style(options.scale_m or (0.0, model.info.max_depth_m)), options)
     start = time.monotonic()
     try:
         if inputs.images:
@@ -106,6 +112,7 @@ def _predict_images(job: Job, items: list[Item]) -> None:
     unwritten: dict[str, str] = {}
 
     def write(key: str, depth: DepthMap) -> None:
+        job.note_camera(key, depth)
         try:
             write_depth(stems[key], depth, options.formats or IMAGE_FORMATS, job.style)
         except (DataError, OSError) as error:
@@ -149,6 +156,7 @@ def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]
         writers = [stack.enter_context(VideoWriter(path, rate=reader.rate)) for path in videos]
 
         def write(frame: int, depth: DepthMap) -> None:
+            job.note_camera(str(source), depth)
             for name, writer in zip(pictures, writers, strict=True):
                 draw = depth.colourise if name == "colour" else depth.side_by_side
                 writer.write(draw(scale_m=job.style.scale_m))
@@ -176,6 +184,7 @@ def _report(job: Job, *, seconds: float) -> None:
         log.warning("%s", line)
     if not tally.done:
         return
+    _report_cameras(job)
     rate = tally.done / max(seconds, 1e-9)
     log.info("%d predicted in %.1f s (%.1f per second): %s", tally.done, seconds, rate, job.output.resolve())
     record = {
@@ -184,12 +193,25 @@ def _report(job: Job, *, seconds: float) -> None:
         "network_size": list(info.size), "fit": job.model.fit,
         "max_depth_m": info.max_depth_m, "backend": job.model.backend.name,
         "settings": {
-            "input": options.input, "intrinsics": options.intrinsics, "smoothing": options.smoothing,
+            "input": options.input, "camera": options.camera, "smoothing": options.smoothing,
             "precision": options.precision, "frames": options.frames,
         },
-        "scale_m": list(job.style.scale_m), "predicted": tally.done, "failed": tally.failed,
+        "cameras": job.cameras, "scale_m": list(job.style.scale_m), "predicted": tally.done, "failed": tally.failed,
     }  # fmt: skip
     try:
         write_json(job.output / "predictions.json", record)
     except OSError as error:
         log.warning("'%s' could not be written (%s)", job.output / "predictions.json", error.strerror or error)
+
+
+def _report_cameras(job: Job) -> None:
+    """Log which cameras the depths are for: the commonest three, and what to pass where one was assumed."""
+    used = Counter((each["origin"], round(each["depth_factor"], 3)) for each in job.cameras.values())
+    for (origin, factor), count in used.most_common(3):
+        log.info("camera: %s; depth x %g (%d of %d)", origin, factor, count, len(job.cameras))
+    if len(used) > 3:
+        log.info("camera: %d others, see predictions.json", len(used) - 3)
+    if job.model.info.training_focal is None and any(each["known"] for each in job.cameras.values()):
+        log.warning("camera: depth is not scaled, since the camera of this model's training images is not known.")
+    elif job.options.camera == "auto" and not all(each["known"] for each in job.cameras.values()):
+        log.info("camera: metres change with the field of view; state it with camera=fov=<degrees> or f35=<mm>")

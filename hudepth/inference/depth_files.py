@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from hudepth.base.camera import Intrinsics
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import written_whole
 from hudepth.inference.depth_map import DepthMap
@@ -22,10 +21,9 @@ MAX_JPEG_SIDE = 65_500  # pixels, by libjpeg
 
 @dataclass(frozen=True)
 class Style:
-    """What all pictures and point clouds of a run have in common."""
+    """What all pictures of a run have in common."""
 
     scale_m: tuple[float, float]  # ends of the colour scale [m]
-    intrinsics: Intrinsics | None = None  # of the camera, in pixels of the images; None: NYU's, scaled to each
 
 
 FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] = {
@@ -33,7 +31,7 @@ FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] =
     "npy": ("_depth.npy", lambda depth, file, _: file.write(npy(depth))),
     "colour": ("_depth.jpg", lambda depth, file, style: file.write(jpeg(depth.colourise(scale_m=style.scale_m)))),
     "side": ("_side.jpg", lambda depth, file, style: file.write(jpeg(depth.side_by_side(scale_m=style.scale_m)))),
-    "ply": ("_depth.ply", lambda depth, file, style: file.write(depth.point_cloud(style.intrinsics).to_ply())),
+    "ply": ("_depth.ply", lambda depth, file, _: file.write(depth.point_cloud().to_ply())),
 }
 """By name: the file's ending, and what writes it; ``png16`` in mm, ``npy`` and ``ply`` in m, others are pictures."""
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import struct
+import zlib
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from numpy.typing import NDArray
 
-from hudepth.base.camera import Intrinsics
+from hudepth.base.camera import CameraChoice, CameraLike, Intrinsics
 from hudepth.base.errors import DataError
 from hudepth.data.store import MAX_STORED, MM_PER_M, to_mm
 from hudepth.viz.colour import colour_depth
@@ -24,36 +23,41 @@ FAST_PNG = (
 """A fifth larger than with OpenCV's defaults, in half the time, which counts next to a network that takes 50 ms."""
 
 
-def _camera(values: Sequence[float] | NDArray[Any]) -> Intrinsics:
-    try:
-        numbers = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if numbers.shape == (3, 3):
-        numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
-    if numbers.shape != (4,):
-        raise TypeError("intrinsics: pass (fx, fy, cx, cy) as a tuple, list or array, or a 3 x 3 camera matrix.")
-    fx, fy, cx, cy = (float(number) for number in numbers)
-    return Intrinsics(fx, fy, cx, cy)
-
-
 @dataclass(frozen=True)
 class DepthMap:
     """The depth of each pixel of an image."""
 
     metres: Float[np.ndarray, "h w"]  # distance along the optical axis [m], float32
     image: UInt8[np.ndarray, "h w 3"]  # the image it was predicted from, upright, RGB
-    max_depth_m: float  # maximum depth the model can predict [m]
+    max_depth_m: float  # maximum depth the model can predict for this camera [m]
     notes: tuple[str, ...] = ()  # what reading changed in the image, if it is not obvious
+    camera: Intrinsics | None = None  # which took the image, in its pixels, or is assumed; None: NYU's is
+    camera_factor: float = 1.0  # by which the network's depth was multiplied for that camera
+
+    @property
+    def whose_camera(self) -> str:
+        """Whose camera was used, and what it did to the depth, in words."""
+        origin = (self.camera or Intrinsics.of_photo(*self.metres.shape)).origin
+        return f"{origin}{self._factor_words}"
+
+    @property
+    def _factor_words(self) -> str:
+        return "" if self.camera_factor == 1 else f"; depth x {self.camera_factor:.3f} for it"
 
     def to_png16(self) -> bytes:
         """Return a 16-bit PNG file in millimetres, as NYU, ScanNet and Kinect tools use: rounded.
 
-        Raises DataError if a depth is beyond 65.535 m, the most that such a file holds.
+        Its text ``camera`` states the camera. Raises DataError if a depth is beyond 65.535 m, the most that such a
+        file holds.
         """
         if round((largest := float(self.metres.max(initial=0))) * MM_PER_M) > MAX_STORED:
             raise DataError(f"depth of {largest:.5g} m, 16-bit millimetres hold 65.535 m. Use formats=[npy].")
-        return cv2.imencode(".png", to_mm(self.metres), FAST_PNG)[1].tobytes()
+        data = cv2.imencode(".png", to_mm(self.metres), FAST_PNG)[1].tobytes()
+        if self.camera is None:
+            return data
+        text = b"tEXtcamera\0" + f"{self.camera}{self._factor_words}".encode("latin-1", "replace")
+        chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+        return data[:33] + chunk + data[33:]  # after the signature and the header
 
     def colourise(
         self, *, scale_m: tuple[float, float] | None = None, legend: bool = True
@@ -68,13 +72,15 @@ class DepthMap:
         """Return the image with its coloured depth to the right."""
         return np.hstack([self.image, self.colourise(scale_m=scale_m)])
 
-    def point_cloud(self, intrinsics: Intrinsics | Sequence[float] | NDArray[Any] | None = None) -> PointCloud:
-        """Return one coloured point per pixel.
+    def point_cloud(self, camera: CameraLike | None = None) -> PointCloud:
+        """Return one coloured point per pixel, by default with the camera that the depth was predicted for.
 
-        ``intrinsics`` are (fx, fy, cx, cy) or a 3 x 3 camera matrix, in pixels; by default NYU's, scaled. Raises
-        ConfigError if they cannot be of this picture, TypeError if they are no such numbers.
+        Another ``camera``, as :func:`hudepth.load` takes it, moves the points to the sides and leaves depth as it is.
+        Raises ConfigError if it cannot be of this picture, TypeError if it is no camera.
         """
-        camera = intrinsics if intrinsics is None or isinstance(intrinsics, Intrinsics) else _camera(intrinsics)
-        if camera is not None:
-            camera.check_fit(*self.metres.shape)
-        return point_cloud(self.metres, self.image, camera)
+        shape = self.metres.shape
+        chosen = None if camera is None else CameraChoice.of(camera).of_picture(*shape)
+        if chosen is not None:
+            return point_cloud(self.metres, self.image, chosen)
+        cloud = point_cloud(self.metres, self.image, self.camera)
+        return replace(cloud, comment=cloud.comment + self._factor_words)

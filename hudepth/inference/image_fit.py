@@ -1,4 +1,4 @@
-"""Resize an image of any size and shape to the network's input, and its depth back."""
+"""Resize an image of any size and shape to the network's input, and its depth back, in the metres of its camera."""
 
 from __future__ import annotations
 
@@ -8,12 +8,19 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hudepth.base.camera import Intrinsics
 from hudepth.base.images import resize_image
 from hudepth.base.normalise import IMAGENET_MEAN
 
 Fit = Literal["stretch", "letterbox"]
 """``stretch`` resizes the whole image to the network's input, as in training. ``letterbox`` first pads it with grey to
 the shape of the training images: proportions stay as the network knows them, at the price of resolution."""
+
+
+FOCAL_POWERS = (0.15, 0.6)
+"""Powers of the ratios of focal lengths, horizontal and vertical, by which a network's depth is multiplied. They are
+measured on crops of NYU's training images with the bundled model (``experiments/field_of_view``): a room that is cut
+left and right looks as far as before, and one that is cut on all sides less near than it is enlarged."""
 
 
 class Fitted(NamedTuple):
@@ -45,3 +52,25 @@ def unfit_depth(
     """Resize the depth of a fitted image to the image's own (height, width), bilinearly."""
     inside = np.ascontiguousarray(depth_m[box])
     return np.asarray(cv2.resize(inside, (size[1], size[0]), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def camera_factor(
+    camera: Intrinsics, fitted: Fitted, size: tuple[int, int], training_focal: tuple[float, float]
+) -> float:
+    """Return by what a network's depth is multiplied for a picture of another camera than that of its training.
+
+    What appears twice as large is half as far, or was taken with twice the focal length. Were size all that a network
+    goes by, depth would have to be multiplied by the ratio of focal lengths at its input (the canonical camera of Yin
+    et al., Metric3D, ICCV 2023). It also goes by what else a picture shows, so the ratios count with the powers
+    :data:`FOCAL_POWERS`.
+
+    Args:
+        camera: in pixels of the picture.
+        fitted: the picture at the network's size.
+        size: (height, width) of the picture.
+        training_focal: focal lengths of the training camera over the sides of its pictures, horizontal and vertical.
+    """
+    (rows, columns), (height, width) = fitted.box, fitted.rgb.shape[:2]
+    across = camera.fx / size[1] * (columns.stop - columns.start) / (training_focal[0] * width)
+    down = camera.fy / size[0] * (rows.stop - rows.start) / (training_focal[1] * height)
+    return float(across ** FOCAL_POWERS[0] * down ** FOCAL_POWERS[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -13,20 +13,21 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from PIL import Image
 
+from hudepth.base.camera import CameraChoice, CameraLike, CameraOption, Intrinsics
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.images import Photo, as_rgb, pillow_rgb, read_photo
 from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Range, Size, parse
 from hudepth.inference.backends import EXPORTED, Backend, BackendName, Precision, TorchBackend, open_exported
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.image_fit import Fit, Fitted, fit_image, unfit_depth
+from hudepth.inference.image_fit import Fit, Fitted, camera_factor, fit_image, unfit_depth
 from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import OPENVINO_PRECISIONS
 from hudepth.runs.checkpoint import load_checkpoint
 
-Picture = str | Path | bytes | NDArray[Any] | torch.Tensor | Image.Image
-"""An image: a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), a tensor of such numbers, with
-the channels first or last, or a Pillow image."""
+Picture = Photo | str | Path | bytes | NDArray[Any] | torch.Tensor | Image.Image
+"""An image: one that was read, a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), a tensor of
+such numbers, with the channels first or last, or a Pillow image."""
 
 
 class Prepared(NamedTuple):
@@ -34,23 +35,32 @@ class Prepared(NamedTuple):
 
     photo: Photo
     fitted: Fitted
+    camera: Intrinsics
+    factor: float
+    """By which depth is multiplied for this camera; 1 if it is only assumed."""
 
 
 class DepthModel:
-    """Predicts depth in metres from single images of any size; ``fit`` and ``flip`` as in :func:`load`."""
+    """Predicts depth in metres from single images of any size; options as in :func:`load`."""
 
-    def __init__(self, backend: Backend, *, fit: Fit = "stretch", flip: bool = False) -> None:
+    def __init__(
+        self, backend: Backend, *, fit: Fit = "stretch", flip: bool = False, camera: CameraLike | CameraChoice = "auto"
+    ) -> None:
         self.backend, self.flip = backend, flip
         self.fit: Fit = fit
+        self.camera = CameraChoice.of(camera)
 
     @property
     def info(self) -> ModelInfo:
         """Description of the model and its training."""
         return self.backend.info
 
-    def predict(self, image: Picture) -> DepthMap:
-        """Predict the depth of one image, at its own size; raises DataError if it cannot be read."""
-        prepared = self.prepare(image)
+    def predict(self, image: Picture, *, camera: CameraLike | None = None) -> DepthMap:
+        """Predict the depth of one image, at its own size; ``camera`` as in :func:`load`, by default the model's.
+
+        Raises DataError if the image cannot be read, ConfigError if the camera cannot have taken it.
+        """
+        prepared = self.prepare(image, camera=camera)
         return self.finish(prepared, self.run([prepared])[0])
 
     def predict_many(self, images: Iterable[Picture], *, batch_size: int = 1) -> list[DepthMap]:
@@ -59,11 +69,13 @@ class DepthModel:
         depths = [d for at in range(0, len(prepared), batch_size) for d in self.run(prepared[at : at + batch_size])]
         return [self.finish(each, depth) for each, depth in zip(prepared, depths, strict=True)]
 
-    def prepare(self, image: Picture) -> Prepared:
-        """Decode an image and resize it to the network's input; raises DataError if it cannot be read."""
+    def prepare(self, image: Picture, *, camera: CameraLike | None = None) -> Prepared:
+        """Decode an image and resize it to the network's input; see :meth:`predict`."""
         if isinstance(image, torch.Tensor):
             image = _pixels(image)
-        if isinstance(image, Image.Image):
+        if isinstance(image, Photo):
+            photo = image
+        elif isinstance(image, Image.Image):
             photo = Photo(pillow_rgb(image), ())
         elif isinstance(image, np.ndarray):
             photo = Photo(as_rgb(image), ())
@@ -71,7 +83,16 @@ class DepthModel:
             photo = read_photo(image)
         else:
             raise TypeError(f"image: {type(image).__name__}. Pass a path, bytes, array, tensor or Pillow image.")
-        return Prepared(photo, fit_image(photo.rgb, self.info.size, fit=self.fit, aspect=self.info.aspect))
+        fitted = fit_image(photo.rgb, self.info.size, fit=self.fit, aspect=self.info.aspect)
+        size = (photo.rgb.shape[0], photo.rgb.shape[1])
+        choice = self.camera if camera is None else CameraChoice.of(camera)
+        known, training = choice.of_picture(*size, photo.camera), self.info.training_focal
+        if known is not None:
+            return Prepared(photo, fitted, known, camera_factor(known, fitted, size, training) if training else 1.0)
+        assumed = self.info.assumed_camera(*size)
+        if choice.kind == "auto" and photo.camera:
+            assumed = replace(assumed, origin=f"{assumed.origin}, since {photo.camera}")
+        return Prepared(photo, fitted, assumed, 1.0)
 
     def run(self, batch: Sequence[Prepared]) -> Float[np.ndarray, "b h w"]:
         """Return depth [m] at the network's size; raises CheckpointError if it is not finite, or negative."""
@@ -94,7 +115,10 @@ class DepthModel:
         """Resize the network's depth to the image's size."""
         rgb = prepared.photo.rgb
         metres = unfit_depth(depth_m, prepared.fitted.box, (rgb.shape[0], rgb.shape[1]))
-        return DepthMap(metres, rgb, self.info.max_depth_m, prepared.photo.notes)
+        if prepared.factor != 1:
+            metres = metres * np.float32(prepared.factor)
+        limit = self.info.max_depth_m * prepared.factor
+        return DepthMap(metres, rgb, limit, prepared.photo.notes, prepared.camera, prepared.factor)
 
 
 def _pixels(image: torch.Tensor) -> NDArray[Any]:
@@ -122,6 +146,7 @@ class ModelOptions:
     size: Size | None = None
     fit: Fit = "stretch"
     flip: bool = False
+    camera: CameraOption = "auto"
     trust: list[str] = field(default_factory=list)
 
 
@@ -135,6 +160,7 @@ def load(
     size: tuple[int, int] | int | None = None,
     fit: str = "stretch",
     flip: bool = False,
+    camera: CameraLike = "auto",
     trust: Iterable[str] = (),
     runs: str | Path = "runs",
 ) -> DepthModel:
@@ -151,6 +177,10 @@ def load(
         size: (height, width) of the network's input; default: that of its training. Exported files have a fixed one.
         fit: ``stretch`` or ``letterbox``.
         flip: average with the mirrored image's prediction: a little better, twice the time.
+        camera: which took the images: ``auto`` (what EXIF states in a file, else the camera of the training images),
+            ``training`` (always that), ``fov=62`` (horizontal field of view [degrees]), ``f35=26`` (focal length for
+            35 mm film [mm]), ``f=1450`` (focal length [pixels]), (fx, fy, cx, cy) in pixels of the image, or a 3 x 3
+            camera matrix. Depth is scaled for any other camera than that of the training.
         trust: further packages whose classes a checkpoint may name; ``pt2`` to load a ``.pt2`` file.
         runs: where ``last`` looks.
 
@@ -159,6 +189,7 @@ def load(
     values = {
         "checkpoint": str(spec), "backend": backend, "device": device, "precision": precision, "threads": threads,
         "size": size, "fit": fit, "flip": flip, "runs": runs,
+        "camera": camera if isinstance(camera, str) else Intrinsics.of(camera).numbers,
         "trust": trust if isinstance(trust, str) else list(trust),
     }  # fmt: skip
     return load_model(parse(ModelOptions, values))
@@ -166,6 +197,7 @@ def load(
 
 def load_model(chosen: ModelOptions) -> DepthModel:
     """Load the model that the options name; raises as :func:`load` does."""
+    how: Any = {"fit": chosen.fit, "flip": chosen.flip, "camera": CameraChoice.of(chosen.camera)}
     path, threads = Path(chosen.checkpoint).expanduser(), chosen.threads or usable_cores()
     if path.suffix.lower() in EXPORTED and not path.is_dir():
         if chosen.size is not None:
@@ -177,7 +209,7 @@ def load_model(chosen: ModelOptions) -> DepthModel:
         graph = open_exported(
             path, backend=chosen.backend, threads=threads, trust=chosen.trust, precision=chosen.precision
         )
-        return DepthModel(graph, fit=chosen.fit, flip=chosen.flip)
+        return DepthModel(graph, **how)
     export = f"hudepth-export checkpoint={chosen.checkpoint} format=openvino"
     if chosen.backend not in ("auto", "torch"):
         raise ConfigError(f"backend={chosen.backend}: needs an exported file. Run {export} first.")
@@ -191,4 +223,4 @@ def load_model(chosen: ModelOptions) -> DepthModel:
     backend = TorchBackend.of_checkpoint(
         checkpoint, device=device, trust=chosen.trust, size=chosen.size, precision=chosen.precision
     )
-    return DepthModel(backend, fit=chosen.fit, flip=chosen.flip)
+    return DepthModel(backend, **how)

@@ -7,13 +7,18 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
+from hudepth.base.camera import NYU_FOCAL, Intrinsics
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import Range, parse
 from hudepth.runs.checkpoint import Checkpoint
 
 VERSION = 1  # of the description that exported files carry
 USUAL_ASPECT = 4 / 3  # width over height if a checkpoint does not record it: that of NYU Depth V2 and most sensors
+NYU_SOURCES = ("nyu_labeled", "nyu_mat", "nyu_raw", "densedepth", "rooms")  # taken or rendered with NYU's camera
 MAX_SIDE = 8192  # descriptions that ask for larger images are refused
+
+
+_Focal = Annotated[float, Range(0.1, 20)]
 
 
 @dataclass(frozen=True)
@@ -28,12 +33,32 @@ class ModelInfo:
     epoch: int  # finished epochs of training
     trained_on: dict[str, Any] = field(default_factory=dict)  # source, fingerprint, encoding and split of the data
     aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT  # width over height of the original training images
+    focal: tuple[_Focal, _Focal] | None = None
+    """Focal lengths of the training camera over the sides of its pictures, horizontal and vertical; see
+    :attr:`training_focal`."""
     processing: bool = True  # whether a graph maps RGB bytes to metres, else normalised images to unit depth
 
     def __str__(self) -> str:
         source, size = self.trained_on.get("source") or "unknown data", f"{self.size[0]} x {self.size[1]}"
         network = f"{self.name} of {self.parameters:,} parameters"
         return f"{network}, trained on {source} for {self.epoch} epochs; {size}, up to {self.max_depth_m:g} m"
+
+    @property
+    def training_focal(self) -> tuple[float, float] | None:
+        """``focal``, NYU's for its data sets and the rooms; None if the training camera is not known."""
+        return self.focal or (NYU_FOCAL if self.trained_on.get("source") in NYU_SOURCES else None)
+
+    def assumed_camera(self, height: int, width: int) -> Intrinsics:
+        """Return the training camera for a picture of this size; NYU's if that is not known.
+
+        It has square pixels, and the field of view of the longer side, where the shapes differ.
+        """
+        if self.focal is None:
+            return Intrinsics.of_photo(height, width)
+        fx, fy = self.focal[0] * width, self.focal[1] * height
+        if abs(width / height / self.aspect - 1) >= 0.01:
+            fx = fy = self.focal[int(self.aspect < 1)] * max(height, width)
+        return Intrinsics.centred(fx, fy, height, width, known=False, origin="the training camera, assumed")
 
     def to_json(self) -> str:
         """Return the description as JSON."""

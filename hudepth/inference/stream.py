@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel, Picture, Prepared
 
@@ -94,6 +94,8 @@ class Stream(Generic[Key]):
             return self.model.prepare(picture)
         except DataError as error:
             return error
+        except ConfigError as error:  # the camera cannot have taken this picture
+            return DataError(str(error))
 
     def _predict(self, lot: list[tuple[Key, Prepared | DataError]]) -> Iterator[tuple[Key, Callable[[], None] | None]]:
         """Yield each key of a lot with the function that writes its depth, None if it is unreadable."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hudepth.base.camera import Intrinsics
+from hudepth.base.camera.intrinsics import Intrinsics
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,6 @@ def point_cloud(
     seen = depth_m.reshape(-1) > 0
     if not seen.all():
         points, colours = points[seen], None if colours is None else colours[seen]
-    whose = "as given" if camera.known else f"NYU Depth V2's, scaled to {width} x {height}: not this camera's own"
-    comment = (
-        "x right, y down, z forward, in metres\n"
-        f"camera: fx {camera.fx:.3f} fy {camera.fy:.3f} cx {camera.cx:.3f} cy {camera.cy:.3f} pixels, {whose}"
-    )
+    whose = "" if camera.known else f", scaled to {width} x {height}: not this camera's own"
+    comment = f"x right, y down, z forward, in metres\ncamera: {camera}{whose}"
     return PointCloud(points, colours, comment)

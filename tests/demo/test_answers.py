@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hudepth.base.camera import Intrinsics
+from hudepth.base.camera import CameraLike, Intrinsics
 from hudepth.base.errors import DataError
 from hudepth.data.store import to_mm
 from hudepth.demo.answers import Answer, Limits, answer, colour_table, reduce_depth
@@ -21,11 +21,9 @@ from .conftest import HOSTILE, encoded
 LIMITS = Limits(upload_bytes=2**20, pixels=40_000_000)
 
 
-def answered(
-    folder: Path, model: DepthModel, data: bytes, name: str = "a.png", camera: Intrinsics | None = None
-) -> Answer:
+def answered(folder: Path, model: DepthModel, data: bytes, name: str = "a.png", camera: CameraLike = "auto") -> Answer:
     (folder / name).write_bytes(data)
-    return answer(folder / name, model, LIMITS, camera)
+    return answer(folder / name, DepthModel(model.backend, camera=camera), LIMITS)
 
 
 def depth_of(payload: dict[str, object]) -> np.ndarray:
@@ -75,13 +73,23 @@ def test_one_row_is_a_picture_too(tmp_path: Path, model: DepthModel) -> None:
 
 
 def test_a_camera_is_scaled_with_the_picture(tmp_path: Path, model: DepthModel) -> None:
-    given = answered(tmp_path, model, encoded(960, 1280, "JPEG"), camera=Intrinsics(1000, 1100, 639.5, 479.5))
-    assert given.camera == Intrinsics(500, 550, 319.5, 239.5)
+    given = answered(tmp_path, model, encoded(960, 1280, "JPEG"), camera=(1000, 1100, 639.5, 479.5))
+    assert given.shown.camera == Intrinsics(500, 550, 319.5, 239.5)
     assert given.payload["camera"] == [500, 550, 319.5, 239.5]
-    nyu = answered(tmp_path, model, encoded(960, 1280, "JPEG")).camera
+    nyu = answered(tmp_path, model, encoded(960, 1280, "JPEG")).shown.camera
     assert nyu == Intrinsics.of_nyu(480, 640)
     assert not nyu.known
     assert nyu.scale(1, 1) == nyu
+
+
+def test_a_portrait_has_square_pixels_and_a_wrong_camera_is_said(tmp_path: Path, model: DepthModel) -> None:
+    portrait = answered(tmp_path, model, encoded(800, 547, "JPEG"))
+    fx, fy, _, _ = portrait.payload["camera"]
+    assert fx == pytest.approx(fy, rel=2e-3)  # the shown picture has whole pixels
+    assert "camera: NYU Depth V2's, assumed" in portrait.payload["caption"]
+    wrong = answered(tmp_path, model, encoded(96, 128), camera=(1000, 1100, 639.5, 479.5))
+    assert wrong.shown.camera == Intrinsics.of_nyu(96, 128)
+    assert "camera= is not of a picture of this size" in wrong.payload["caption"]
 
 
 def test_an_animation_says_that_one_frame_was_taken(tmp_path: Path, model: DepthModel) -> None:

@@ -78,5 +78,5 @@ def test_the_headline_says_what_the_numbers_are_worth() -> None:
 
     text = headline(ModelInfo("Net", (32, 48), 10.0, 4_650_000, 5, {"source": "<i>"}), "as given")
     assert "Net of 4,650,000 parameters, trained on &lt;i&gt; for 5 epochs; 32 x 48, up to 10 m." in text
-    assert "Camera of the point cloud: as given." in text
+    assert "Camera: as given." in text
     assert "Do not trust" in text

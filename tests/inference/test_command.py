@@ -114,10 +114,10 @@ def test_what_cannot_be_written_is_named_and_the_rest_is_done(tiny: Path, photos
 
 
 def test_a_camera_in_millimetres_is_refused(tiny: Path, photos: Path, command: Command) -> None:
-    camera = "intrinsics=[4.2,4.2,2,3]"
+    camera = "camera=[4.2,4.2,2,3]"
     done = command("predict", f"checkpoint={tiny}", "input=photos/a.png", "formats=[ply]", camera, "output=out")
     assert done.code == 1
-    assert re.search("intrinsics: .* 64 x 48.* pixels", done.err)
+    assert re.search("camera: .* 64 x 48.* pixels", done.err)
     assert not list(Path("out").glob("*.ply"))
 
 
@@ -191,7 +191,7 @@ def test_letterbox_and_size_and_scale(tiny: Path, photos: Path, command: Command
         (("formats=[]",), r"formats: \[\] .* png16, npy"),
         (("smoothing=1",), "smoothing: 1 .* below 1"),
         (("scale_m=[4,1]",), r"scale_m: \[4,1\] .* rising"),
-        (("intrinsics=[1,2,3]",), r"intrinsics: \[1,2,3\] .*fx,fy,cx,cy"),
+        (("camera=[1,2,3]",), r"camera: \[1,2,3\] .*fx,fy,cx,cy"),
         (("size=[30,48]",), "data.size: .*30 x 48.* multiples of 16"),
         (("size=[224]",), r"size: \[224\] .*height,width"),
         (("fit=crop",), "fit: 'crop' .* stretch, letterbox"),

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hudepth.inference.image_fit import Fit, fit_image, unfit_depth
+from hudepth.base.camera import NYU_FOCAL, Intrinsics
+from hudepth.inference.image_fit import Fit, camera_factor, fit_image, unfit_depth
 
 sides = st.integers(1, 90)
 
@@ -42,3 +44,18 @@ def test_depth_is_resized_bilinearly_about_pixel_centres() -> None:
     depth = np.array([[1.0, 3.0]], np.float32)
     back = unfit_depth(depth, (slice(0, 1), slice(0, 2)), (1, 4))
     assert back[0].tolist() == [1.0, 1.5, 2.5, 3.0]
+
+
+@pytest.mark.parametrize("fit", ["stretch", "letterbox"])
+def test_the_training_camera_needs_no_factor_and_a_narrower_one_its_ratio(fit: Fit) -> None:
+    def factor(camera: Intrinsics, height: int, width: int) -> float:
+        fitted = fit_image(np.zeros((height, width, 3), np.uint8), (224, 224), fit=fit, aspect=4 / 3)
+        return camera_factor(camera, fitted, (height, width), NYU_FOCAL)
+
+    nyu = Intrinsics.of_nyu(480, 640)
+    assert factor(nyu, 480, 640) == pytest.approx(1)
+    assert factor(nyu.scale(0.5, 0.5), 240, 320) == pytest.approx(1)  # a smaller copy has the same field of view
+    middle = Intrinsics(nyu.fx, nyu.fy, nyu.cx - 160, nyu.cy - 120)
+    assert factor(middle, 240, 320) == pytest.approx(2**0.75)  # the middle of a picture, enlarged
+    wide, high = Intrinsics(nyu.fx / 2, nyu.fy, 319.5, 239.5), Intrinsics(nyu.fx, nyu.fy / 2, 319.5, 239.5)
+    assert (factor(wide, 480, 640), factor(high, 480, 640)) == pytest.approx((2**-0.15, 2**-0.6))

@@ -66,9 +66,9 @@ def test_tensors_are_pictures_and_lists_are_cameras(grey: DepthModel) -> None:
     matrix = np.array([[60, 0, 32], [0, 61, 24], [0, 0, 1]])
     for camera in ([60.0, 61.0, 32.0, 24.0], np.array([60, 61, 32, 24]), matrix):
         np.testing.assert_array_equal(depth.point_cloud(camera).points_m, given)
-    with pytest.raises(TypeError, match=r"intrinsics: .*list"):
+    with pytest.raises(TypeError, match=r"camera: .*list"):
         depth.point_cloud([60.0, 61.0])
-    with pytest.raises(ConfigError, match=r"intrinsics: .*64 x 48"):
+    with pytest.raises(ConfigError, match=r"camera: .*64 x 48"):
         depth.point_cloud([4.2, 4.2, 2.0, 3.0])
 
 

@@ -55,7 +55,7 @@ def test_nyu_stands_in_for_a_camera_that_nobody_stated_and_the_file_says_so() ->
     lines, _ = read_ply(point_cloud(np.ones((240, 320), np.float32), None).to_ply())
     (line,) = (line for line in lines if line.startswith("comment camera"))
     assert "fx 259.429 fy 259.735" in line  # half of NYU's at half the size
-    assert "NYU Depth V2's, scaled to 320 x 240: not this camera's own" in line
+    assert "NYU Depth V2's, assumed, scaled to 320 x 240: not this camera's own" in line
     whole = Intrinsics.of_nyu(480, 640)
     assert (whole.fx, whole.fy, whole.cx, whole.cy) == pytest.approx((518.857901, 519.469611, 325.582449, 253.736166))
     # the middle of the image stays the middle: a pixel's centre lies half a pixel from its edge
@@ -67,5 +67,5 @@ def test_nyu_stands_in_for_a_camera_that_nobody_stated_and_the_file_says_so() ->
 
 @pytest.mark.parametrize("values", [(0.0, 1.0, 0.0, 0.0), (1.0, float("nan"), 0.0, 0.0), (1.0, 1.0, float("inf"), 0.0)])
 def test_no_camera(values: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match=r"^intrinsics: .* Pass intrinsics="):
+    with pytest.raises(ConfigError, match=r"^camera: .* Pass camera="):
         Intrinsics(*values)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.camera import Intrinsics
+from hudepth.base.camera.intrinsics import Intrinsics
 from hudepth.data.rooms.materials import Material, pattern_weight
 from hudepth.data.rooms.raycast import BOX, CYLINDER, F32, F64, ROOM_FACES, Solids, View, trace
 

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.camera import Intrinsics
+from hudepth.base.camera.intrinsics import Intrinsics
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import Broadcast, Choice, Range, convert
 from hudepth.data.rooms.fittings import CATEGORIES

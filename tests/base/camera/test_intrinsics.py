@@ -21,7 +21,7 @@ def test_a_photograph_of_another_shape_has_square_pixels() -> None:
 
 @pytest.mark.parametrize("values", [(4.2, 4.2, 2, 3), (500, 4.2, 48, 64), (5000, 5000, 48, 64), (100, 100, 300, 64)])
 def test_a_camera_of_another_picture(values: tuple[float, float, float, float]) -> None:
-    with pytest.raises(ConfigError, match=r"intrinsics: .*96 x 128.*pixels"):
+    with pytest.raises(ConfigError, match=r"camera: .*96 x 128.*pixels"):
         Intrinsics(*values).check_fit(128, 96)
     Intrinsics(100, 110, 48, 64).check_fit(128, 96)
 
