@@ -5,7 +5,7 @@ INSTALLED := .venv/.installed
 # each test process would compile every module again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install demo test test-all lint ledger format clean
+.PHONY: help install demo test test-all test-gpu lint ledger format clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -27,6 +27,9 @@ test: $(INSTALLED)  ## run the fast tests, in a few minutes
 
 test-all: $(INSTALLED)  ## run all tests, as continuous integration does
 	$(BIN)/python -m pytest -n auto --dist worksteal --durations 25
+
+test-gpu: $(INSTALLED)  ## run the tests that need an NVIDIA GPU
+	$(BIN)/python -m pytest --durations 25 -m gpu tests/cuda
 
 lint: $(INSTALLED)  ## ruff and mypy --strict
 	$(BIN)/ruff check .

@@ -110,3 +110,29 @@ class _StayingThere(TorchDispatchMode):
 def staying_on(device: str) -> TorchDispatchMode:
     """Fail where an operation returns a tensor elsewhere: copying it to the device later would wait for the device."""
     return _StayingThere(device)
+
+
+_GUESSING = {
+    "adaptive_max_pool2d_backward", "_adaptive_avg_pool2d_backward", "avg_pool3d_backward", "grid_sampler_2d_backward",
+    "histc", "kthvalue", "nll_loss2d_forward", "put", "put_", "reflection_pad2d_backward", "replication_pad1d_backward",
+    "upsample_bicubic2d_backward", "upsample_bilinear2d_backward", "upsample_linear1d_backward",
+}  # fmt: skip
+"""Operations without a deterministic version on GPUs; see torch.use_deterministic_algorithms."""
+
+
+class _Deterministic(TorchDispatchMode):
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = func.overloadpacket.__name__
+        assert name not in _GUESSING, func
+        weights = kwargs.get("weights", args[1] if len(args) > 1 else None)
+        assert not (name == "bincount" and weights is not None), func
+        assert not (name == "median" and func._overloadname == "dim"), func
+        result = func(*args, **kwargs)
+        assert not (name in ("cumsum", "cumsum_") and result.is_floating_point()), func
+        return result
+
+
+def deterministic() -> TorchDispatchMode:
+    """Fail where an operation would have no deterministic version on a GPU."""
+    return _Deterministic()

@@ -47,8 +47,8 @@ def align(pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, kind: str) -> De
 
 
 def _median(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
-    # the mean of the two middle values, as numpy's: torch.median takes the lower
-    middle_p, middle_t = ((x.kthvalue((len(x) + 1) // 2)[0] + x.kthvalue(len(x) // 2 + 1)[0]) / 2 for x in (p, t))
+    # the mean of the two middle values, as numpy's: torch.median takes the lower; kthvalue may differ on GPUs
+    middle_p, middle_t = ((x.median() - (-x).median()) / 2 for x in (p, t))
     return pred * (middle_t / middle_p) if middle_p > 0 else pred
 
 

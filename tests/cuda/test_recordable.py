@@ -16,7 +16,7 @@ from hudepth.data.augment import Augmentation
 from hudepth.losses.distillation import Distillation
 from hudepth.training.module import DepthModule
 from tests.data.test_augment import EVERYTHING
-from tests.devices import staying_on
+from tests.devices import deterministic, staying_on
 
 LOSSES = ("badcl", "berhu", "gradient", "l1", "l2", "mixture", "silog")
 
@@ -54,7 +54,7 @@ def test_a_step_stays_on_its_device(overrides: list[str], monkeypatch: pytest.Mo
     )  # fmt: skip
     if distill:
         batch["teacher"] = depth
-    with staying_on("meta"):
+    with staying_on("meta"), deterministic():
         module._step(batch, "train").backward()
     assert all(each.grad is not None for each in module.net.parameters())
 

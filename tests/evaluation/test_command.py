@@ -14,8 +14,10 @@ import torch
 from hudepth.base.errors import DataError
 from hudepth.evaluation.lineage import refuse_training_pairs
 from hudepth.evaluation.test_data import open_data
+from hudepth.metrics.alignment import ALIGNMENTS, align
 from hudepth.runs.checkpoint import KEY, load_checkpoint, read_plain
 from tests.commands import TINY, Command
+from tests.devices import deterministic
 
 
 def metrics(folder: Path) -> dict[str, Any]:
@@ -43,6 +45,17 @@ def test_a_checkpoint_needs_nothing_else(spec: str, command: Command, run: Path,
         assert (run / "test" / protocol / "panels.png").stat().st_size > 10_000
     assert "mean depth map" in done.out
     assert "eigen protocol, 2 test images of rooms" in done.out
+
+
+def test_a_gpu_scores_with_deterministic_operations_alone(command: Command, run: Path, trained: Path) -> None:
+    shutil.rmtree(run / "test")
+    with deterministic():
+        done = command("test", f"checkpoint={run}", "trainer.accelerator=cpu")
+        depths = 1 + torch.rand(2, 1, 8, 8), 1 + torch.rand(2, 1, 8, 8), torch.rand(2, 1, 8, 8) > 0.2
+        for kind in ALIGNMENTS:
+            align(*depths, kind=kind)
+    assert done.code == 0, done.err
+    assert metrics(run / "test" / "eigen") == metrics(trained / "test" / "eigen")
 
 
 def test_the_metric_file_states_its_protocol(trained: Path) -> None:
