@@ -33,6 +33,16 @@ _FIXES = {
 }  # fmt: skip
 """What to do about a file that could not be written, by the system's number of the error."""
 
+_FULL = ("CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED", "CUDNN_STATUS_ALLOC_FAILED")
+_LESS = {
+    "train": "a smaller data.batch_size=, data.on_device=false or trainer.accelerator=cpu",
+    "test": "a smaller data.batch_size= or trainer.accelerator=cpu",
+    "predict": "a smaller batch_size= or size=, or device=cpu",
+    "demo": "device=cpu", "bench": "smaller batches= or device=cpu",
+}  # fmt: skip
+"""What takes less of a GPU's memory, by command."""
+_ON_CPU = {"train": "trainer.accelerator=cpu", "test": "trainer.accelerator=cpu"}
+
 
 def one_line(error: BaseException, task: str) -> str:
     """Return an error as one line that suggests a fix.
@@ -46,7 +56,7 @@ def one_line(error: BaseException, task: str) -> str:
         if isinstance(cause, HudepthError):
             return " ".join(str(cause).split())
     for cause in chain:
-        if line := _config_line(cause, task):
+        if line := gpu_line(cause, task) or _config_line(cause, task):
             return line
     for cause in chain:
         if isinstance(cause, OSError) and (line := unwritten(cause)):
@@ -66,6 +76,20 @@ def unwritten(error: OSError) -> str:
         return ""
     name = f"'{error.filename}'" if error.filename else "a file"
     return f"{name} cannot be written ({os.strerror(error.errno)}). {_FIXES[error.errno]}"
+
+
+def gpu_line(error: BaseException, task: str) -> str:
+    """Return the line of a GPU that is full or taken; empty for other errors."""
+    text = str(error)  # PyTorch's own class is not imported for it: that takes seconds
+    if type(error).__name__ == "OutOfMemoryError" or any(each in text for each in _FULL):
+        wanted = re.search(r"Tried to allocate ([\d.]+ \w+)", text)
+        free = re.search(r"of which ([\d.]+ \w+) is free", text)
+        found = ", ".join([*([f"{wanted[1]} more needed"] if wanted else []), *([f"{free[1]} free"] if free else [])])
+        fix = f"Pass {_LESS.get(task, 'device=cpu')}, or end what else uses the GPU (nvidia-smi lists it)."
+        return f"the GPU has too little memory{f' ({found})' if found else ''}. {fix}"
+    if "busy or unavailable" in text:
+        return f"the GPU is taken by another program (nvidia-smi lists it). Pass {_ON_CPU.get(task, 'device=cpu')}."
+    return ""
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

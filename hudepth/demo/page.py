@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import gradio as gr
+import torch
 
 from hudepth.base.console import log
 from hudepth.base.errors import HudepthError
+from hudepth.base.wording import gpu_line
 from hudepth.demo.answers import Answer, colour_table
 from hudepth.demo.session_files import Files
 from hudepth.inference.model_info import ModelInfo
@@ -76,6 +78,10 @@ def handler(compute: Callable[[Path], Answer], files: Files) -> Callable[..., It
         files.begin(session, Path(upload))
         try:
             answer = compute(Path(upload))
+        except torch.OutOfMemoryError as error:
+            log.warning("%s", gpu_line(error, "demo"))
+            yield ({"error": "The graphics card has too little memory left. Try again later."}, *off)
+            return
         except (HudepthError, MemoryError) as error:
             lack = "This machine has too little memory for the picture. Resize it."
             yield ({"error": lack if isinstance(error, MemoryError) else str(error)}, *off)

@@ -29,6 +29,8 @@ from hudepth.inference.video import FrameReader, VideoWriter
 IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]  # defaults
 PICTURES = {"colour": "_depth.mp4", "side": "_side.mp4"}  # formats that make a video of a video, and its ending
 
+MOST_WORKERS = 16  # threads that decode and write beside a GPU
+
 _FOR_ALL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}  # what ends a run: a full or broken disk
 
 
@@ -62,6 +64,17 @@ class Job:
     tally: Tally = field(default_factory=Tally)
     cameras: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By input, the camera it was predicted for; that of the first frame for a video."""
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the network does not compute on the CPU."""
+        device = getattr(self.model.backend, "device", None)
+        return device is not None and device.type != "cpu"
+
+    @property
+    def batch_size(self) -> int:
+        """Images that go through the network together: one on a CPU, whose caches overflow with more."""
+        return self.options.batch_size or (16 if self.on_gpu else 1)
 
     def note_camera(self, name: str, depth: DepthMap) -> None:
         """Record which camera an input was predicted for."""
@@ -106,9 +119,6 @@ def predict(config: dict[str, Any]) -> None:
 
 def _predict_images(job: Job, items: list[Item]) -> None:
     options, stems = job.options, {str(item.path): job.output / item.stem for item in items}
-    device = getattr(job.model.backend, "device", None)
-    on_gpu = device is not None and device.type != "cpu"
-
     unwritten: dict[str, str] = {}
 
     def write(key: str, depth: DepthMap) -> None:
@@ -122,8 +132,9 @@ def _predict_images(job: Job, items: list[Item]) -> None:
         job.model,
         write,
         tally=job.tally,
-        batch_size=options.batch_size or (16 if on_gpu else 1),  # on CPUs larger batches are slower: caches overflow
-        overlap=on_gpu or (options.threads or usable_cores()) < usable_cores(),
+        batch_size=job.batch_size,
+        workers=max(2, min(usable_cores(), MOST_WORKERS)) if job.on_gpu else 2,  # a GPU outruns one that decodes
+        overlap=job.on_gpu or (options.threads or usable_cores()) < usable_cores(),
     )
     for _ in track(stream.run((str(i.path), i.path) for i in items), total=len(items), what="predicting"):
         pass
@@ -164,7 +175,10 @@ def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]
                 write_depth(stem / f"{frame:06d}", depth, files, job.style)
 
         # one thread keeps the frames in order
-        stream: Stream[int] = Stream(job.model, write, tally=job.tally, smoothing=job.options.smoothing, workers=1)
+        stream: Stream[int] = Stream(
+            job.model, write, tally=job.tally, smoothing=job.options.smoothing, workers=1, batch_size=job.batch_size,
+            overlap=job.on_gpu,
+        )  # fmt: skip
         frames = stream.run(islice(enumerate(reader), limit))
         try:
             for _ in track(frames, total=limit or reader.expected or 0, what=f"predicting {reader.name}"):

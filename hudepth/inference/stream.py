@@ -17,7 +17,7 @@ from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel, Picture, Prepared
 
 Key = TypeVar("Key")
-LOT = 8  # images per thread that are decoded, predicted and written together: few enough for memory
+LOT, MOST = 8, 64  # images that are decoded, predicted and written together, per thread and in all: memory holds three
 
 
 @dataclass
@@ -75,7 +75,8 @@ class Stream(Generic[Key]):
         self, pool: ThreadPoolExecutor, pictures: Iterable[tuple[Key, Picture]]
     ) -> Iterator[list[tuple[Key, Prepared | DataError]]]:
         """Yield lots of decoded images; with ``overlap`` the next one is decoded meanwhile."""
-        left, size = iter(pictures), max(LOT * self.workers, self.batch_size)
+        left, size = iter(pictures), max(min(LOT * self.workers, MOST), self.batch_size)
+        size -= size % self.batch_size  # whole batches: on a GPU each other size is recorded anew
 
         def begin() -> list[tuple[Key, Future[Prepared | DataError]]]:
             return [(key, pool.submit(self._prepare, picture)) for key, picture in islice(left, size)]

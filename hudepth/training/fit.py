@@ -181,6 +181,8 @@ def run_epochs(training: Training, trainer: Trainer, module: DepthModule, data: 
         try:
             with one_ending(trainer):
                 trainer.fit(module, datamodule=data, ckpt_path=last, weights_only=True)
+        except torch.OutOfMemoryError:
+            raise
         except (AttributeError, IndexError, KeyError, TypeError, ValueError, RuntimeError) as error:
             steps = read_plain(last).get("global_step") if last else None
             if trainer.global_step not in (0, steps) or last is None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from hudepth.base.errors import DataError
 from hudepth.demo.answers import Answer, Limits, answer
@@ -45,7 +46,12 @@ def test_the_depth_comes_before_the_files(model: DepthModel, visitor: Any) -> No
 
 
 @pytest.mark.parametrize(
-    ("error", "shown"), [(DataError("'<b>': no"), "'<b>': no"), (MemoryError(), "This machine has too little memory")]
+    ("error", "shown"),
+    [
+        (DataError("'<b>': no"), "'<b>': no"),
+        (MemoryError(), "This machine has too little memory"),
+        (torch.OutOfMemoryError("CUDA out of memory."), "The graphics card has too little memory"),
+    ],
 )
 def test_what_goes_wrong_is_for_the_page(error: Exception, shown: str, visitor: Any) -> None:
     from hudepth.demo.page import handler

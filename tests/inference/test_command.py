@@ -8,15 +8,19 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import hudepth
 from hudepth.inference import video
+from hudepth.inference.model import DepthModel
 from tests.commands import Command, script
 
 RANDOM = np.random.default_rng(0)
@@ -224,6 +228,53 @@ def test_a_disk_that_fills_up(
     assert done.code == 1
     line = f"hudepth-predict: output: cannot write to 'out' ({os.strerror(code)}); 0 were predicted. {fix}, or pass"
     assert line in done.err
+
+
+@pytest.mark.parametrize("kind", ["images", "video"])
+def test_a_gpu_gets_batches_from_many_threads(
+    kind: str, grey: DepthModel, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grey.backend.device = torch.device("cuda")  # type: ignore[attr-defined]
+    decoding, prepare, together = set(), grey.prepare, threading.Barrier(5, timeout=20)
+
+    def watched(picture: Any) -> Any:
+        if (thread := threading.get_ident()) not in decoding:
+            decoding.add(thread)
+            if kind == "images":
+                together.wait()  # passes only if five decode at once
+        return prepare(picture)
+
+    monkeypatch.setattr(grey, "prepare", watched)
+    monkeypatch.setattr("hudepth.inference.command.load_model", lambda _: grey)
+    monkeypatch.setattr("hudepth.inference.command.usable_cores", lambda: 5)
+    if kind == "images":
+        for number in range(40):
+            cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((32, 48, 3), number, np.uint8))
+        given = tmp_path
+    else:
+        given = tmp_path / "a.avi"
+        film(given, 40)
+    done = command("predict", f"input={given}", "formats=[npy]", "output=out")
+    assert done.code == 0, done.err
+    assert grey.backend.batches == [16, 16, 8]  # type: ignore[attr-defined]
+    assert len(decoding) == (5 if kind == "images" else 1)
+    files = sorted((tmp_path / "out").rglob("*.npy"), key=lambda path: int(re.findall(r"\d+", path.stem)[0]))
+    values = [float(np.load(path).mean()) for path in files]
+    shades = np.arange(40) if kind == "images" else 9 * np.arange(40) % 256
+    np.testing.assert_allclose(values, shades / 100, atol=0.02)
+
+
+def test_a_gpu_that_fills_up(tiny: Path, photos: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has")
+
+    monkeypatch.setattr("hudepth.inference.backends.DepthPipeline.forward", full)
+    done = command("predict", f"checkpoint={tiny}", f"input={photos}")
+    assert done.code == 1
+    line = done.err.splitlines()[-1]
+    assert line.startswith(
+        "hudepth-predict: the GPU has too little memory (2.00 GiB more needed). Pass a smaller batch_"
+    )
 
 
 def test_what_predict_sees_is_what_test_sees(tiny: Path) -> None:

@@ -310,6 +310,20 @@ def test_two_processes_train_into_one_run_directory(tmp_path: Path, cache: Path)
     assert done.stdout.count("epoch 2 of 2") == 1
 
 
+def test_a_gpu_that_fills_up(command: Command, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A resumed run is not blamed for it."""
+
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr("hudepth.training.module.DepthModule.training_step", full)
+    for options in ((*TINY, "name=new"), (f"resume={trained}", "trainer.max_epochs=3")):
+        done = command("train", *options)
+        assert done.code == 1
+        line = done.err.splitlines()[-1]
+        assert line.startswith("hudepth-train: the GPU has too little memory. Pass a smaller data.batch_size=")
+
+
 def test_a_run_directory_does_not_vouch_for_its_own_classes(command: Command, trained: Path, tmp_path: Path) -> None:
     stranger = tmp_path / "stranger"
     shutil.copytree(trained, stranger)
