@@ -64,6 +64,11 @@ def uses_cuda(accelerator: str) -> bool:
     return accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
 
 
+def copy_to(x: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """Copy a tensor of the CPU to a device, without waiting for what the device still computes."""
+    return (x.pin_memory() if device.type == "cuda" else x).to(device, non_blocking=True)
+
+
 class Arithmetic(NamedTuple):
     """How a training computes: ``precision`` of Lightning's Trainer, and whether float32 products use TF32."""
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from lightning.pytorch.utilities.model_helpers import is_overridden
 from torch import Tensor
 from torch.optim import Optimizer
@@ -162,8 +163,8 @@ def _settings(optimizer: Optimizer) -> list[dict[str, Any]]:
 
 def _obstacle(trainer: Trainer) -> str:
     """Return why the steps of a training cannot be recorded; empty if they can."""
-    if trainer.world_size > 1:
-        return "several processes train"
+    if not isinstance(trainer.strategy, SingleDeviceStrategy):
+        return f"{type(trainer.strategy).__name__} shares gradients among processes"
     if getattr(trainer.precision_plugin, "scaler", None) is not None:
         return f"trainer.precision={trainer.precision} scales gradients"
     if trainer._detect_anomaly:

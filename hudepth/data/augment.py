@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.machine import copy_to
 from hudepth.base.options import Range, check
 from hudepth.data.colours import MAX_BLUR, blur, change_colours, cut_depth
 from hudepth.data.warp import Geometry, cut_border, resize, warp
@@ -94,7 +95,7 @@ class Augmentation:
         Returns:
             ``numbers`` [n, count], uniform in [0, 1), and if there is noise, ``noise`` [count, 3, *size], normal.
         """
-        draws = {"numbers": torch.rand(_DRAWS, count, generator=generator).to(device, non_blocking=True)}
+        draws = {"numbers": copy_to(torch.rand(_DRAWS, count, generator=generator), device)}
         if self.noise:
             there = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
             draws["noise"] = torch.randn(count, 3, *size, generator=there, device=device)

@@ -11,6 +11,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from hudepth.base.console import log
+from hudepth.base.machine import copy_to
 from hudepth.base.types import RawBatch
 from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
@@ -73,7 +74,7 @@ class DeviceDataset(StoreDataset):
 
     def __getitems__(self, positions: Sequence[int]) -> RawBatch:
         """Return the batch at these positions, gathered on the device."""
-        places = torch.tensor(positions).to(self._rows.device, non_blocking=True)
+        places = copy_to(torch.tensor(positions), self._rows.device)
         image, depth, rows = (x.index_select(0, places) for x in (self._image, self._depth, self._rows))
         return RawBatch(image=image, stored_depth=depth.view(torch.uint16), index=rows, per_m=self.store.per_m)
 
