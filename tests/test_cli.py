@@ -43,7 +43,7 @@ def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
         ("train", ["+experiment=demoo"], "experiment: no 'demoo'. Did you mean 'demo'? Pass one of badcl, demo,"),
         ("train", ["-m", "loss=l3,l4"], "loss: no 'l3'. Pass one of badcl, berhu, gradient, l1, l2,"),
         ("train", ["just words"], "cannot read 'just words': write key=value, and quote values with"),
-        ("test", [], "checkpoint is not set. Pass checkpoint=<file | run directory | last>."),
+        ("test", [], "checkpoint is not set. Pass checkpoint=<file | run directory | last>, or predictions=<folder"),
         ("test", ["checkpoint=nowhere.ckpt"], "checkpoint: no file or run directory 'nowhere.ckpt'. Pass a "),
         ("test", ["checkpoint=last"], "checkpoint=last: no run with a checkpoint below 'runs'. Train one with"),
         ("data", [], "a verb is missing. Type hudepth-data followed by prepare or info or audit."),

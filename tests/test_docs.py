@@ -44,13 +44,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that has what the README's commands name: nyu with index.csv, mine with images and depths."""
     folder = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(0)
-    for kind in ("nyu", "mine/images", "mine/depths"):
+    for kind in ("nyu", "mine/images", "mine/depths", "midas"):
         (folder / kind).mkdir(parents=True)
     rows = ["index,image,depth,scene,category,split,depth_scale_m,depth_offset"]
     for i in range(20):
         image, depth = rng.integers(0, 255, (48, 64, 3), np.uint8), rng.integers(100, 255, (48, 64), np.uint8)
         cv2.imwrite(str(folder / f"nyu/{i:05d}.jpg"), image)
         cv2.imwrite(str(folder / f"nyu/{i:05d}.png"), depth)
+        np.save(folder / f"midas/{i:05d}.npy", 1 / (depth + 0.5).astype(np.float32))
         rows.append(f"{i},{i:05d}.jpg,{i:05d}.png,room_{i},room,{'train' if i < 12 else 'test'},0.01,0.5")
         cv2.imwrite(str(folder / f"mine/images/{i}.png"), image)
         cv2.imwrite(str(folder / f"mine/depths/{i}.png"), depth.astype(np.uint16) * 10)

@@ -17,12 +17,15 @@ from hudepth.base.masked import widen, widest_float
 from hudepth.metrics.alignment import align
 from hudepth.metrics.depth import SUM_NAMES, DepthMaps, depth_maps
 from hudepth.metrics.protocol import Protocol
+from hudepth.metrics.scale import SCALE_NAMES, scale_errors
 from hudepth.metrics.ssim import ssim_map, whole_windows
 
 T = TypeVar("T")
 
-SUM_COLUMNS = (*SUM_NAMES, "ssim")
-"""Columns of a row of sums: those of :func:`hudepth.metrics.depth.depth_sums`, then the image's ssim."""
+IMAGE_COLUMNS = (*SCALE_NAMES, "ssim")
+"""What is known of an image as a whole."""
+SUM_COLUMNS = (*SUM_NAMES, *IMAGE_COLUMNS)
+"""Columns of a row of sums: those of :func:`hudepth.metrics.depth.depth_sums`, then those of the image."""
 
 
 class Cache:
@@ -62,10 +65,13 @@ class Grid:
 
 
 class Scored:
-    """A prediction [m] on a grid, shared by all protocols that resize it in the same way."""
+    """A prediction [m] on a grid, shared by all protocols that resize it in the same way.
 
-    def __init__(self, pred_m: Float[Tensor, "b 1 h w"], grid: Grid) -> None:
-        self.pred_m, self.grid = pred_m, grid
+    ``inverse``: it is inverse depth, for protocols that align it.
+    """
+
+    def __init__(self, pred_m: Float[Tensor, "b 1 h w"], grid: Grid, *, inverse: bool = False) -> None:
+        self.pred_m, self.grid, self._inverse = pred_m, grid, inverse
         self._cache = Cache()
 
     def prediction(self, protocol: Protocol) -> Float[Tensor, "b 1 h w"]:
@@ -80,12 +86,14 @@ class Scored:
             row = torch.zeros(
                 len(self.pred_m), len(SUM_COLUMNS), dtype=widest_float(self.pred_m.device), device=self.pred_m.device
             )
-            row[:, -1] = torch.nan
+            row[:, -len(IMAGE_COLUMNS) :] = torch.nan
             return row
         rows, columns = window
         counts = self.grid.counts(protocol)
         sums = self._maps(protocol).sums(counts, masked=counts is self.grid.measured, rows=rows, columns=columns)
-        return torch.stack([*sums.values(), self._ssim(protocol, rows, columns)], dim=1)
+        pred_m, truth_m = (x[..., rows, columns] for x in (self.prediction(protocol), self.grid.depth_m))
+        scale = scale_errors(pred_m, truth_m, counts[..., rows, columns])
+        return torch.stack([*sums.values(), *scale.T, self._ssim(protocol, rows, columns)], dim=1)
 
     def _variant(self, protocol: Protocol) -> tuple[object, ...]:
         """Return the key of the aligned and clamped prediction; protocols with equal keys share it."""
@@ -105,7 +113,7 @@ class Scored:
             counts = torch.zeros_like(self.grid.measured)
             rows, columns = protocol.window(*counts.shape[-2:]) or (slice(0), slice(0))
             counts[..., rows, columns] = self.grid.counts(protocol)[..., rows, columns]
-            pred_m = align(pred_m, self.grid.depth_m, counts, kind=protocol.alignment)
+            pred_m = align(pred_m, self.grid.depth_m, counts, kind=protocol.alignment, inverse=self._inverse)
         return pred_m.clamp(protocol.min_depth_m, protocol.max_depth_m) if protocol.clamp else pred_m
 
     def _maps(self, protocol: Protocol) -> DepthMaps:

@@ -99,6 +99,10 @@ def print_results(
     first = next(iter(metrics))
     caption = f"95 %: bootstrap over {over}"
     _print_widest([make_table(metrics, ranges, metric_names(level), title, caption) for level in LEVELS])
+    if metric_names("scale", among=metrics[first]):
+        columns = ["abs_rel", "abs_rel_aligned", "scale_sd", "rmse", "rmse_pooled"]
+        about = "each image at its median scale; rmse of images and of all pixels"
+        _print_widest([make_table(metrics, ranges, names, about, "") for names in (columns, columns[1:])])
     if edges := metric_names("edges", among=metrics[first]):
         chosen = [edges, metric_names("edge", among=edges)]
         only = {first: metrics[first]}

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from hudepth.base.errors import DataError
+from hudepth.base.types import RawBatch
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.preprocess import preprocess
@@ -58,19 +60,35 @@ def panels_beside(runs: Mapping[str, Path], ids: Sequence[str], *, config: Mappi
 @torch.inference_mode()
 def make_panels(module: nn.Module, store: DepthStore, indices: Sequence[int], *, max_depth_m: float) -> list[Panel]:
     """Predict pairs of a store; the network turns a normalised image into depth / max_depth_m."""
-    panels = []
     was_training = module.training
     module.eval()
     device = next(module.parameters()).device
+
+    def predict(raw: RawBatch, truth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        image = preprocess(raw, max_depth_m=max_depth_m)["image"]
+        unit: NDArray[np.float32] = module(image.to(device)).float().cpu()[0, 0].numpy()
+        return unit * np.float32(max_depth_m)
+
+    panels = draw_beside(predict, store, indices, max_depth_m=max_depth_m)
+    module.train(was_training)
+    return panels
+
+
+def draw_beside(
+    predict: Callable[[RawBatch, NDArray[np.float32]], NDArray[np.float32]],
+    store: DepthStore,
+    indices: Sequence[int],
+    *,
+    max_depth_m: float,
+) -> list[Panel]:
+    """Return panels of pairs of a store; ``predict`` returns depth [h, w] [m] for a batch of one and its truth [m]."""
+    panels = []
     dataset = StoreDataset(store, indices)
     for position in range(len(dataset)):  # a DataLoader would advance the random generator of the training
         raw = dataset[position]
-        batch = preprocess(raw, max_depth_m=max_depth_m)
-        pred_m = module(batch["image"].to(device)).float().cpu()[0, 0] * max_depth_m
         truth_m = np.minimum(raw["stored_depth"][0].numpy() / np.float32(store.per_m), np.float32(max_depth_m))
         record = store.records[int(raw["index"][0])]
-        panels.append(Panel(raw["image"][0].numpy(), truth_m, pred_m.numpy(), title=record.id))
-    module.train(was_training)
+        panels.append(Panel(raw["image"][0].numpy(), truth_m, predict(raw, truth_m), title=record.id))
     return panels
 
 

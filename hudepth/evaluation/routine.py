@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from hudepth.base.errors import ConfigError
 from hudepth.base.types import Batch
 from hudepth.evaluation.baselines import Baseline
+from hudepth.evaluation.predictions import FilePredictions
 from hudepth.evaluation.scoring import BatchScores, BatchTruth
 from hudepth.metrics.protocol import Protocol
 
@@ -19,8 +20,9 @@ from hudepth.metrics.protocol import Protocol
 class Evaluation(LightningModule):
     """Collects one row of sums per image for each predictor and protocol. Run it with ``Trainer.test``.
 
-    Predictors turn a normalised image into depth / max_depth_m; boundaries and strata are measured of the ``detailed``
-    one only, if a protocol asks for them. Raises ConfigError if two protocols have the same name.
+    Predictors turn a normalised image into depth / max_depth_m, or are read from files. Boundaries and strata are
+    measured of the ``detailed`` one alone, if a protocol asks for them. Raises ConfigError if two protocols have one
+    name.
     """
 
     def __init__(
@@ -52,9 +54,12 @@ class Evaluation(LightningModule):
         self._keep(batch["index"], "index")
         truth = BatchTruth(batch, max_depth_m=self.max_depth_m)
         for name, predictor in self.predictors.items():
-            plain, flipped = self._predict(predictor, batch["image"])
-            plain_scores = BatchScores(plain, truth)
-            flipped_scores = plain_scores if flipped is None else BatchScores(flipped, truth)
+            if isinstance(predictor, FilePredictions):
+                plain_scores = flipped_scores = BatchScores(predictor.read(batch), truth, inverse=predictor.inverse)
+            else:
+                plain, flipped = self._predict(predictor, batch["image"])
+                plain_scores = BatchScores(plain, truth)
+                flipped_scores = plain_scores if flipped is None else BatchScores(flipped, truth)
             for protocol in self.protocols:
                 scores = flipped_scores if protocol.flip else plain_scores
                 self._keep(scores.sums(protocol), "sums", name, protocol.name)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from lightning.pytorch.callbacks import RichProgressBar
+from numpy.typing import NDArray
 from torch import nn
 
 from hudepth.base.console import log, shows_progress
@@ -17,17 +19,20 @@ from hudepth.base.files import output_folder
 from hudepth.base.instantiate import import_trusted
 from hudepth.base.machine import float32_products
 from hudepth.base.options import Range
+from hudepth.base.types import RawBatch
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
 from hudepth.evaluation.lineage import note_scored
 from hudepth.evaluation.outputs import Metrics, write_outputs
-from hudepth.evaluation.pictures import evenly_spaced, make_panels
+from hudepth.evaluation.pictures import draw_beside, evenly_spaced, make_panels
+from hudepth.evaluation.predictions import FilePredictions
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.routine import Evaluation
+from hudepth.metrics.protocol import Protocol
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint
 from hudepth.runs.results import MODEL
-from hudepth.viz.panels import save_panels
+from hudepth.viz.panels import Panel, save_panels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +63,52 @@ def score_checkpoint(
     import_trusted(options.trust)
     protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
     output_folder(output, within=checkpoint.run if checkpoint.run in output.parents else None)
-    net = checkpoint.build_net(trust=options.trust)
-    predictors: dict[str, nn.Module] = {MODEL: inference_form(net, size=datamodule.size)}
+    net = inference_form(checkpoint.build_net(trust=options.trust), size=datamodule.size)
+
+    def origin() -> dict[str, Any]:
+        found = {"file": checkpoint.path.name, "epoch": checkpoint.epoch}
+        found["trained_on"] = {**checkpoint.data, "split": checkpoint.split}
+        return {"checkpoint": {**found, "scored_before": note_scored(checkpoint, datamodule, protocols)}}
+
+    def draw(shown: Sequence[int]) -> list[Panel]:
+        return make_panels(net, datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
+
+    return _score(net, protocols, options, output=output, datamodule=datamodule, origin=origin, draw=draw)
+
+
+def score_predictions(
+    predictions: FilePredictions, options: ScoreOptions, *, output: Path, datamodule: DepthDataModule
+) -> dict[str, Metrics]:
+    """Score predictions of test pairs that lie in files, as :func:`score_checkpoint` does a checkpoint's."""
+    import_trusted(options.trust)
+    protocols = build_protocols(options.protocol, datamodule=datamodule, trust=options.trust)
+    protocols = [predictions.protocol(protocol) for protocol in protocols]
+    output_folder(output)
+
+    def draw(shown: Sequence[int]) -> list[Panel]:
+        def predict(raw: RawBatch, truth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+            return predictions.beside(int(raw["index"][0]), truth_m)
+
+        return draw_beside(predict, datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
+
+    return _score(
+        predictions, protocols, options, output=output, datamodule=datamodule,
+        origin=lambda: {"predictions": predictions.stamp()}, draw=draw,
+    )  # fmt: skip
+
+
+def _score(
+    model: nn.Module,
+    protocols: Sequence[Protocol],
+    options: ScoreOptions,
+    *,
+    output: Path,
+    datamodule: DepthDataModule,
+    origin: Callable[[], dict[str, Any]],
+    draw: Callable[[Sequence[int]], list[Panel]],
+) -> dict[str, Metrics]:
+    """Score a model and trivial baselines; ``origin`` states what it is, ``draw`` makes panels of store positions."""
+    predictors: dict[str, nn.Module] = {MODEL: model}
     if options.baselines and not datamodule.split.train:
         log.info("no trivial baselines: data.split=%s has no training pairs to make them of", datamodule.split.kind)
     elif options.baselines:
@@ -67,8 +116,7 @@ def score_checkpoint(
     evaluation = Evaluation(predictors, protocols, max_depth_m=datamodule.max_depth_m, detailed=MODEL)
     if not run_evaluation(evaluation, datamodule, options.trainer):
         return {}
-    stamp = _stamp(checkpoint, datamodule)
-    stamp["checkpoint"]["scored_before"] = note_scored(checkpoint, datamodule, protocols)
+    stamp = {**_stamp(datamodule), **origin()}
     results: dict[str, Metrics] = {}
     failed = []
     for protocol in protocols:
@@ -77,8 +125,7 @@ def score_checkpoint(
         except ConfigError as error:  # the results of the other protocols are not lost
             failed.append(error)
     if options.panels:
-        shown = evenly_spaced(evaluation.indices, options.panels)
-        panels = make_panels(predictors[MODEL], datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
+        panels = draw(evenly_spaced(evaluation.indices, options.panels))
         for name in results:
             save_panels(output / name / "panels.png", panels)
     if failed:
@@ -109,14 +156,12 @@ def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options:
     return trainer.is_global_zero
 
 
-def _stamp(checkpoint: Checkpoint, datamodule: DepthDataModule) -> dict[str, Any]:
-    """Return what metrics.json states about data, split and checkpoint."""
+def _stamp(datamodule: DepthDataModule) -> dict[str, Any]:
+    """Return what metrics.json states about data and split."""
     info = datamodule.store.info
-    trained_on = {**checkpoint.data, "split": checkpoint.split}
     return {
         "data": {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes", "skipped")},
         "split": datamodule.split.summary(),
         "network_size": list(datamodule.size),
         "max_depth_m": datamodule.max_depth_m,
-        "checkpoint": {"file": checkpoint.path.name, "epoch": checkpoint.epoch, "trained_on": trained_on},
     }

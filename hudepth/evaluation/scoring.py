@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.masked import widen
 from hudepth.base.types import Batch
 from hudepth.data.sources.base import Record
-from hudepth.evaluation.grids import SUM_COLUMNS, Cache, Grid, Scored
+from hudepth.evaluation.grids import IMAGE_COLUMNS, SUM_COLUMNS, Cache, Grid, Scored
 from hudepth.metrics.boundary import BOUNDARY_NAMES, boundary_metrics
 from hudepth.metrics.catalogue import registered_functions
 from hudepth.metrics.depth import depth_metrics_from_sums
@@ -46,13 +45,15 @@ class BatchTruth:
 
 
 class BatchScores:
-    """Predictions of a batch [m] at network resolution, for scoring under any number of protocols.
+    """Predictions of a batch [m], for scoring under any number of protocols: at network resolution, or each at its own.
 
-    Other predictions may share the ground truth.
+    ``inverse``: they are inverse depths, for protocols that align them. Other predictions may share the ground truth.
     """
 
-    def __init__(self, pred_m: Float[Tensor, "b 1 h w"], truth: BatchTruth) -> None:
-        self._pred_m, self._truth = pred_m, truth
+    def __init__(
+        self, pred_m: Float[Tensor, "b 1 h w"] | Sequence[Tensor], truth: BatchTruth, *, inverse: bool = False
+    ) -> None:
+        self._pred_m, self._truth, self._inverse = pred_m, truth, inverse
         self._cache = Cache()
 
     def sums(self, protocol: Protocol) -> Float[Tensor, "b k"]:
@@ -83,19 +84,26 @@ class BatchScores:
                 yield pred_m[..., *window], truth_m[..., *window], counts[..., *window]
 
     def _scored(self, protocol: Protocol) -> list[Scored]:
-        key = protocol.resize if protocol.needs_native else None
+        fits = isinstance(self._pred_m, Tensor) and not protocol.needs_native
+        key = protocol.needs_native, None if fits else protocol.resize
         return self._cache.get(key, lambda: self._on_grids(protocol))
 
     def _on_grids(self, protocol: Protocol) -> list[Scored]:
-        grids = self._truth.grids(protocol)
-        if not protocol.needs_native:
-            return [Scored(self._pred_m, grids[0])]
-        how: dict[str, Any] = {"mode": _MODES[protocol.resize]}
-        how["align_corners"] = None if protocol.resize == "nearest" else False
-        return [
-            Scored(functional.interpolate(pred[None], size=grid.depth_m.shape[-2:], **how), grid)
-            for pred, grid in zip(self._pred_m, grids, strict=True)
-        ]
+        grids, predictions = self._truth.grids(protocol), self._pred_m
+        if protocol.needs_native:
+            pairs = zip(predictions, grids, strict=True)
+            resized = [_resize(pred[None], grid.depth_m.shape[-2:], protocol) for pred, grid in pairs]
+        elif isinstance(predictions, Tensor):
+            resized = [predictions]
+        else:
+            size = grids[0].depth_m.shape[-2:]
+            resized = [torch.cat([_resize(pred[None], size, protocol) for pred in predictions])]
+        return [Scored(pred, grid, inverse=self._inverse) for pred, grid in zip(resized, grids, strict=True)]
+
+
+def _resize(pred: Float[Tensor, "1 1 h w"], size: torch.Size, protocol: Protocol) -> Float[Tensor, "1 1 h2 w2"]:
+    corners = None if protocol.resize == "nearest" else False
+    return functional.interpolate(pred, size=size, mode=_MODES[protocol.resize], align_corners=corners)
 
 
 _MODES = {"nearest": "nearest-exact", "bilinear": "bilinear", "bicubic": "bicubic"}
@@ -110,7 +118,7 @@ def image_table(
 ) -> ImageTable:
     """Turn rows of :meth:`BatchScores.sums` and :meth:`BatchScores.boundary` into the metrics of each image."""
     columns = dict(zip((*SUM_COLUMNS, *registered_functions()), sums.T, strict=True))
-    others = {name: columns.pop(name) for name in ("ssim", *registered_functions())}
+    others = {name: columns.pop(name) for name in (*IMAGE_COLUMNS, *registered_functions())}
     values = depth_metrics_from_sums(columns, silog_lambda=protocol.silog_lambda, silog_factor=protocol.silog_factor)
     values |= {LOG_BIAS: columns["log"] / columns["count"], **others}
     if boundary is not None:

@@ -5,6 +5,7 @@ With p the prediction and t the ground truth at the valid pixels of one image:
     median          p * median(t) / median(p)                          Zhou et al. 2017
     least_squares   s p + o,  s and o minimise sum (s p + o - t)^2     Ke et al. 2024 (Marigold)
     affine_inverse  1 / (s / p + o),  s and o minimise sum (s / p + o - 1 / t)^2    Ranftl et al. 2022 (MiDaS)
+                    1 / (s d + o) for a prediction d of inverse depth
 
 An aligned score rates the predicted shape, not its scale in metres: never compare it with an unaligned one.
 """
@@ -17,6 +18,7 @@ from torch import Tensor
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.masked import widen
 from hudepth.base.types import DepthMap, Mask
+from hudepth.metrics.scale import median
 
 ALIGNMENTS = ("none", "median", "least_squares", "affine_inverse")
 
@@ -25,31 +27,34 @@ MAX_DEPTH_M = 1e3
 _MIN_DEPTH_M = 1e-3
 
 
-def align(pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, kind: str) -> DepthMap:
+def align(pred_m: DepthMap, target_m: DepthMap, valid: Mask, *, kind: str, inverse: bool = False) -> DepthMap:
     """Return the predictions, each aligned with its ground truth over its valid pixels.
 
     An image without a valid pixel is returned unchanged, as is one with a median of 0 or less. A prediction that is
     constant where valid has no scale to fit: it is shifted. A NaN or infinite prediction at a valid pixel may spread
     over its image. ``least_squares`` may return 0 m and less.
 
-    Depths are in metres, ``target_m`` positive where valid and ignored elsewhere. Raises ConfigError if ``kind`` is not
-    one of :data:`ALIGNMENTS`.
+    Depths are in metres, ``target_m`` positive where valid and ignored elsewhere; ``inverse``: the predictions are
+    1 / depth, up to scale and shift. Raises ConfigError if ``kind`` is not
+    one of :data:`ALIGNMENTS`, or another than ``affine_inverse`` for inverse depth.
     """
     if kind not in ALIGNMENTS:
         raise ConfigError(
             f"alignment: no '{kind}'.{did_you_mean(kind, ALIGNMENTS)} Pass one of {', '.join(ALIGNMENTS)}."
         )
+    if inverse and kind != "affine_inverse":
+        raise ConfigError(f"alignment: '{kind}' is not for inverse depth. Pass affine_inverse.")
     if kind == "none":
         return pred_m
+    one = _affine_inverted if inverse else _ONE[kind]
     images = zip(widen(pred_m), widen(target_m), valid, strict=True)
-    aligned = [_ONE[kind](pred, pred[mask], target[mask]) if mask.any() else pred for pred, target, mask in images]
+    aligned = [one(pred, pred[mask], target[mask]) if mask.any() else pred for pred, target, mask in images]
     return torch.stack(aligned).to(pred_m.dtype)
 
 
 def _median(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
-    # the mean of the two middle values, as numpy's: torch.median takes the lower; kthvalue may differ on GPUs
-    middle_p, middle_t = ((x.median() - (-x).median()) / 2 for x in (p, t))
-    return pred * (middle_t / middle_p) if middle_p > 0 else pred
+    middle_p = median(p)
+    return pred * (median(t) / middle_p) if middle_p > 0 else pred
 
 
 def _least_squares(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
@@ -58,10 +63,14 @@ def _least_squares(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
 
 
 def _affine_inverse(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
-    scale, shift = _line(1 / p.clamp_min(_MIN_DEPTH_M), 1 / t)
-    inverse = scale / pred.clamp_min(_MIN_DEPTH_M) + shift
+    aligned = _affine_inverted(1 / pred.clamp_min(_MIN_DEPTH_M), 1 / p.clamp_min(_MIN_DEPTH_M), t)
     # an infinite prediction has the inverse 0, which would pass for a depth
-    return torch.where(pred.isfinite(), 1 / inverse.clamp_min(1 / MAX_DEPTH_M), torch.nan)
+    return torch.where(pred.isfinite(), aligned, torch.nan)
+
+
+def _affine_inverted(pred: Tensor, p: Tensor, t: Tensor) -> Tensor:
+    scale, shift = _line(p, 1 / t)
+    return 1 / (scale * pred + shift).clamp_min(1 / MAX_DEPTH_M)
 
 
 def _line(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

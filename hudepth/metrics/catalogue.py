@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-Level = Literal["headline", "narrow", "wide", "edge", "edges", "files"]
-LEVELS: tuple[tuple[Level, ...], ...] = (("headline", "narrow", "wide"), ("edge", "edges"))
+Level = Literal["headline", "narrow", "wide", "scale", "edge", "edges", "files"]
+LEVELS: tuple[tuple[Level, ...], ...] = (("headline", "narrow", "wide"), ("scale",), ("edge", "edges"))
 """Tables of rising width; each has the metrics of those before it."""
 Function = Callable[..., Any]
 """(pred_m, target_m, valid) -> [b]"""
@@ -34,8 +34,8 @@ class MetricInfo:
     higher_is_better: bool = False
     decimals: int = 3
     shown: Level = "files"
-    """The narrowest table that has it: ``headline``, ``narrow`` or ``wide``; of depth edges ``edge`` (in tables of
-    many runs too) or ``edges``; ``files``: only metrics.json and per_image.csv."""
+    """The narrowest table that has it: ``headline``, ``narrow`` or ``wide``; ``scale``: that of the images' scales; of
+    depth edges ``edge`` (in tables of many runs too) or ``edges``; ``files``: only metrics.json and per_image.csv."""
     pool: Literal["pixels", "squares", "images"] = "images"
     """What ``averaging=pooled`` takes: the mean over all pixels, the root of the mean square, or, for metrics that are
     undefined for some images, still the mean over images."""
@@ -88,10 +88,13 @@ for _info in (
     MetricInfo("sq_rel", _EIGEN, unit="m", shown="wide", pool="pixels"),
     MetricInfo("mse", _PAPER, unit="m^2", pool="pixels"),
     MetricInfo("rmse", _EIGEN, unit="m", shown="headline", pool="squares"),
+    MetricInfo("rmse_pooled", f"{_EIGEN}; over the pixels of all images at once", unit="m", shown="scale"),
     MetricInfo("rmse_log", _EIGEN, shown="wide", pool="squares"),
     MetricInfo("log10", _PAPER, shown="narrow", pool="pixels"),
     MetricInfo("silog", _EIGEN, shown="wide", pool="pixels"),
     MetricInfo("mae", "mean absolute error", unit="m", shown="wide", pool="pixels"),
+    MetricInfo("scale_sd", "Godard et al. 2019 (Monodepth2), of logarithms", shown="scale"),
+    MetricInfo("abs_rel_aligned", "Zhou et al. 2017", shown="scale"),
     MetricInfo("ssim", "Wang et al. 2004", higher_is_better=True, shown="narrow"),
     MetricInfo("delta1", _EIGEN, higher_is_better=True, shown="headline", pool="pixels"),
     MetricInfo("delta2", _EIGEN, higher_is_better=True, shown="narrow", pool="pixels"),

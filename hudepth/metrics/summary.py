@@ -6,6 +6,9 @@ Over images: the mean of the images' metrics. Pooled over all pixels, of which n
     rmse, rmse_log                                             sqrt(sum n_i x_i^2 / sum n_i)
     silog   factor * sqrt(rmse_log^2 - lambda * log_bias^2), both pooled; log_bias is the mean of ln p - ln t
 
+Of any set, whatever the averaging: ``rmse_pooled``, the pooled rmse, and ``scale_sd``, the standard deviation of the
+images' log_scale (:mod:`hudepth.metrics.scale`).
+
 So a metric of any set follows from columns that add up over images (:func:`additive`), which resampling uses too. The
 metrics themselves are defined in :mod:`hudepth.metrics.depth`, with which pooling agrees.
 """
@@ -30,6 +33,8 @@ Floats = NDArray[np.float64]
 
 LOG_BIAS = "log_bias"
 """Mean of ln p - ln t: not a metric, but pooled silog follows from it."""
+LOG_SCALE = "log_scale"
+"""Of an image, see :mod:`hudepth.metrics.scale`: not a metric, but ``scale_sd`` follows from it."""
 DEPTH_NAMES = (*depth_names(), LOG_BIAS)
 """Defined for every image with a valid pixel; others, like ssim, may be undefined (NaN) for some images."""
 KEYS = ("id", "scene", "category", "pixels")
@@ -63,7 +68,7 @@ class SummaryOptions(TypedDict):
 
 
 def summarise(table: ImageTable, **options: Unpack[SummaryOptions]) -> dict[str, float]:
-    """Return the metrics of all images of a table together, without ``log_bias``.
+    """Return the metrics of all images of a table together, without ``log_bias`` and ``log_scale``.
 
     Pooled silog only if the table has ``log_bias``. Images without a pixel that counts are skipped. NaN where a
     prediction was NaN (skipping it would flatter), and where a metric is defined for no image.
@@ -83,6 +88,12 @@ def additive(table: ImageTable, *, averaging: str) -> dict[str, Floats]:
             weights[np.isnan(values)] = 0
         terms = weights * (values**2 if pooled and metric_info(name).pool == "squares" else values)
         columns[name] = np.stack([np.where(weights > 0, terms, 0), weights])
+    if "rmse" in table.values:
+        terms = np.where(table.pixels > 0, table.pixels * table.values["rmse"] ** 2, 0)
+        columns["rmse_pooled"] = np.stack([terms, table.pixels.astype(np.float64)])
+    if LOG_SCALE in columns:
+        terms, weights = columns[LOG_SCALE]
+        columns["scale_sd"] = np.stack([terms**2, weights])
     return columns
 
 
@@ -92,7 +103,11 @@ def metrics_from_sums(
     """Turn sums of :func:`additive` columns, [2, *] by name, into metrics, [*] by name; NaN where a weight is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         means = {name: terms / weights for name, (terms, weights) in sums.items()}
-        bias = means.pop(LOG_BIAS, None)
+        bias, log_scale = means.pop(LOG_BIAS, None), means.pop(LOG_SCALE, None)
+        if log_scale is not None:
+            means["scale_sd"] = np.sqrt(np.maximum(means["scale_sd"] - log_scale**2, 0))
+        if "rmse_pooled" in means:
+            means["rmse_pooled"] = np.sqrt(means["rmse_pooled"])
         if averaging == "pooled":
             if means.pop("silog", None) is not None and bias is not None and "rmse_log" in means:
                 variance = means["rmse_log"] - silog_lambda * bias**2

@@ -77,7 +77,8 @@ def test_the_table_is_the_mean_of_the_images(trained: Path) -> None:
         rows = list(csv.DictReader(file))
     table = metrics(trained / "test" / "eigen")["metrics"]["model"]
     assert [row["scene"] for row in rows] == ["room_0005"] * 2
-    for name, value in table.items():
+    of_the_set = {"rmse_pooled", "scale_sd"}
+    for name, value in ((name, value) for name, value in table.items() if name not in of_the_set):
         assert np.mean([float(row[name]) for row in rows]) == pytest.approx(value, rel=1e-5)
 
 

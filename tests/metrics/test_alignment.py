@@ -244,3 +244,13 @@ def test_an_infinite_prediction_is_not_hidden() -> None:
     for kind in ALIGNMENTS[1:]:
         aligned = align(pred, target, torch.ones_like(pred, dtype=torch.bool), kind=kind)
         assert not aligned[0, 0, 0, 0].isfinite(), kind
+
+
+def test_inverse_depth_is_fitted_as_it_is() -> None:
+    """Also where it is 0 or negative, which no depth is the inverse of."""
+    truth = torch.rand(2, 1, 5, 7, dtype=torch.float64) + 0.5
+    stated = 1 / truth * torch.tensor([2.0, -0.3], dtype=torch.float64)[:, None, None, None] - 1.5
+    aligned = align(stated, truth, torch.ones_like(truth, dtype=torch.bool), kind="affine_inverse", inverse=True)
+    torch.testing.assert_close(aligned, truth)
+    with pytest.raises(ConfigError, match="alignment: 'median' is not for inverse depth"):
+        align(stated, truth, truth > 0, kind="median", inverse=True)

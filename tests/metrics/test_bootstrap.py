@@ -187,7 +187,7 @@ def test_paired_differences_use_the_same_draws(averaging: str) -> None:
     noise = np.random.default_rng(1).normal(0.02, 0.005, len(a.ids))
     b = replace(a, values={**{name: column + noise for name, column in a.values.items()}, "edge_f1_0.25": noise})
     differences = paired_differences(a, b, averaging=averaging)
-    assert list(differences) == ["abs_rel", "rmse", "ssim"]  # what only one has is no difference
+    assert list(differences) == ["abs_rel", "rmse", "ssim", "rmse_pooled"]  # what only one has is no difference
     before, after = summarise(a, averaging=averaging), summarise(b, averaging=averaging)
     drawn = bootstrap(b, averaging=averaging)["abs_rel"] - bootstrap(a, averaging=averaging)["abs_rel"]
     for name, difference in differences.items():
