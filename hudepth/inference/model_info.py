@@ -93,6 +93,7 @@ class ModelInfo:
                 "parameters": parameters,
                 "epoch": checkpoint.epoch,
                 "trained_on": {**checkpoint.data, "split": checkpoint.split},
+                "focal": checkpoint.data.get("focal"),
                 "aspect": native[0][1] / native[0][0] if len(native) == 1 else USUAL_ASPECT,
             }
             return parse(cls, values, prefix="data." if size is None else "")

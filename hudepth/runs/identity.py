@@ -11,8 +11,8 @@ LABELS = ("name", "variant", "sweep_dir", "resume", "hydra", "debug")
 """Keys that name a run and say how it was started."""
 SURROUNDINGS = (
     "trust", "test", "baselines", "protocol", "paths", "logger", "callbacks.panels", "callbacks.panels_every_n_epochs",
-    "cuda_graph", "data.root", "data.cache", "data.num_workers", "data.on_device", "data.prepare_workers",
-    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy",
+    "cuda_graph", "data.source.camera", "data.root", "data.cache", "data.num_workers", "data.on_device",
+    "data.prepare_workers", "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy",
 )  # fmt: skip
 """Keys that do not change the trained weights either: paths, hardware, pictures, and how the result is tested."""
 INCIDENTAL = (*LABELS, *SURROUNDINGS)

@@ -11,6 +11,7 @@ from torch import nn
 from torch.optim import Adam, AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from hudepth.base.camera import CameraChoice
 from hudepth.base.console import log
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
@@ -146,6 +147,9 @@ def build_module(
 
     info = datamodule.store.info
     data = {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")}
+    if datamodule.source.camera is not None:
+        choice = CameraChoice.of(datamodule.source.camera, key="data.source.camera")
+        data["focal"] = list(choice.over_sides(info["native_sizes"], key="data.source.camera"))
     if before:
         data[BEFORE] = before
     return DepthModule(

@@ -38,8 +38,8 @@ class CameraChoice:
     given: Intrinsics | None = None
 
     @classmethod
-    def of(cls, option: CameraLike | CameraChoice) -> CameraChoice:
-        """Read the option; raises ConfigError for what is none, TypeError for arrays of other shapes."""
+    def of(cls, option: CameraLike | CameraChoice, *, key: str = "camera") -> CameraChoice:
+        """Read the option named ``key``; raises ConfigError for what is none, TypeError for arrays of other shapes."""
         if isinstance(option, CameraChoice):
             return option
         if not isinstance(option, str):
@@ -51,8 +51,21 @@ class CameraChoice:
             low, high = _RANGES[kind]
             if low <= value <= high:
                 return cls(kind, value)
-            raise ConfigError(f"camera: {kind}={value:g} is not {low} to {high:.0f}. Pass camera={WORDS}.")
-        raise ConfigError(f"camera: '{option}' is not a camera. Pass camera={WORDS}.")
+            raise ConfigError(f"{key}: {kind}={value:g} is not {low} to {high:.0f}. Pass {key}={WORDS}.")
+        raise ConfigError(f"{key}: '{option}' is not a camera. Pass {key}={WORDS}.")
+
+    def over_sides(self, sizes: Sequence[Sequence[int]], *, key: str) -> tuple[float, float]:
+        """Return the focal lengths over the sides of training pictures of these (height, width).
+
+        Raises ConfigError, which names ``key``, if they differ from picture to picture or no camera is stated.
+        """
+        cameras = [(self.of_picture(height, width), height, width) for height, width in sizes]
+        found = [(camera.fx / width, camera.fy / height) for camera, height, width in cameras if camera is not None]
+        if not found:
+            raise ConfigError(f"{key}: '{self.kind}' states no camera. Pass {key}=fov=<degrees>, or leave it out.")
+        if any(abs(other / first - 1) > 0.02 for each in found for first, other in zip(found[0], each, strict=True)):
+            raise ConfigError(f"{key}: pictures of several shapes have no camera in common. Leave {key} out.")
+        return found[0]
 
     def of_picture(self, height: int, width: int, exif: Intrinsics | str = "") -> Intrinsics | None:
         """Return the camera of a picture of this size; None, with which the training camera is meant, if unstated.

@@ -13,6 +13,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hudepth.base.camera import CameraChoice, CameraOption
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import Range, check, convert
 from hudepth.data.encoding import Encoding
@@ -73,6 +74,8 @@ class Source(ABC):
     """Largest depth [m] the store must hold; None: 65.535 m indoors, else 255.996 m. Steps are as fine as it allows."""
     sparse: bool = False
     """Whether few pixels are measured, as by a lidar: measured ones are preferred at training size."""
+    camera: CameraOption | None = None
+    """Which took the images, as ``camera=`` of hudepth-predict states it; None: not known, or NYU's by the source."""
     depth_scale_m: float | None = None
     """Scale of ``linear`` and ``disparity`` where a record has none; see :func:`hudepth.data.encoding.to_metres`."""
     invalid: Sequence[float] | None = None
@@ -86,6 +89,9 @@ class Source(ABC):
         self.encoding = convert("data.encoding", self.encoding, Encoding | None)
         self.depth_scale_m = convert("data.depth_scale_m", self.depth_scale_m, _SCALE | None)
         self.invalid = convert("data.invalid", self.invalid, list[float] | None)
+        self.camera = convert("data.source.camera", self.camera, CameraOption | None)
+        if self.camera is not None:
+            CameraChoice.of(self.camera, key="data.source.camera")
         self.farthest_m = convert("data.source.farthest_m", self.farthest_m, FARTHEST | None)
         if self.depth_scale_m is not None and self.encoding not in (None, "auto", "linear", "disparity"):
             raise ConfigError(

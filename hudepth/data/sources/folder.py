@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import ClassVar
 from unicodedata import normalize
 
+from hudepth.base.camera import CameraOption
 from hudepth.base.errors import DataError
 from hudepth.data.encoding import ENCODINGS, Encoding
 from hudepth.data.sources.base import Record, existing_root
@@ -40,6 +41,7 @@ class FolderSource(FileSource):
     indoor: bool = True
     farthest_m: float | None = None
     sparse: bool = False
+    camera: CameraOption | None = None
     unequal_sizes: bool = False
 
     def records(self) -> Sequence[Record]:

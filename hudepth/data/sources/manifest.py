@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 from unicodedata import normalize
 
+from hudepth.base.camera import CameraOption
 from hudepth.base.errors import DataError
 from hudepth.base.images import read_bytes
 from hudepth.data.encoding import Encoding
@@ -51,6 +52,7 @@ class ManifestSource(FileSource):
     indoor: bool = True
     farthest_m: float | None = None
     sparse: bool = False
+    camera: CameraOption | None = None
     unequal_sizes: bool = False
 
     def records(self) -> Sequence[Record]:

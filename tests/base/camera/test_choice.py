@@ -85,3 +85,14 @@ def test_the_option_takes_words_and_four_numbers(value: object) -> None:
     assert convert("camera", "fov=62", CameraOption) == "fov=62"
     with pytest.raises(ConfigError, match=r"^camera: .*fov=<degrees>"):
         convert("camera", value, CameraOption)
+
+
+def test_the_camera_of_training_pictures_is_over_their_sides() -> None:
+    fov = CameraChoice.of("fov=60").over_sides([(480, 640), (240, 320)], key="data.source.camera")
+    across = 0.5 / math.tan(math.radians(30))
+    assert fov == pytest.approx((across, across * 4 / 3))
+    assert CameraChoice.of((500, 510, 320, 240)).over_sides([(480, 640)], key="x") == (500 / 640, 510 / 480)
+    with pytest.raises(ConfigError, match=r"^data.source.camera: pictures of several shapes"):
+        CameraChoice.of("fov=60").over_sides([(480, 640), (640, 480)], key="data.source.camera")
+    with pytest.raises(ConfigError, match=r"^data.source.camera: 'auto' states no camera"):
+        CameraChoice.of("auto").over_sides([(480, 640)], key="data.source.camera")
