@@ -72,12 +72,15 @@ def _record(function: Callable[[], Any], *, pool: Any = None) -> graphs.Recordin
         for storage, before in recorder.overwritten.values():
             storage.copy_(before)
 
+    inference = torch.is_inference_mode_enabled()
+
     @torch.no_grad()
     def replay() -> None:
-        for func, args, kwargs, result in recorder.operations:
-            for old, new in zip(tree_leaves(result), tree_leaves(func(*args, **kwargs)), strict=True):
-                if isinstance(old, Tensor) and old.untyped_storage().data_ptr() != new.untyped_storage().data_ptr():
-                    old.copy_(new)
+        with torch.inference_mode() if inference else nullcontext():
+            for func, args, kwargs, result in recorder.operations:
+                for old, new in zip(tree_leaves(result), tree_leaves(func(*args, **kwargs)), strict=True):
+                    if isinstance(old, Tensor) and old.untyped_storage().data_ptr() != new.untyped_storage().data_ptr():
+                        old.copy_(new)
 
     return graphs.Recording(replay, results, None)
 

@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from experiments.speed.peers import PEERS
 from hudepth.base.errors import HudepthError
-from hudepth.bench.backends import BACKENDS, REFERENCE, missing
+from hudepth.bench.backends import ON_CPU, REFERENCE, missing
 from hudepth.bench.command import measure
 from hudepth.bench.contenders import Contenders
 from hudepth.bench.plan import make_plan
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", default="nyu", help="a checkpoint, run directory or bundle")
     parser.add_argument("--runs", default="runs", help="the folder that --checkpoint last searches")
-    parser.add_argument("--backends", nargs="+", default=list(BACKENDS), help="of this model")
+    parser.add_argument("--backends", nargs="+", default=ON_CPU, help="of this model")
     parser.add_argument("--batches", type=int, nargs="+", default=[1], help="images per pass; peers are slow on a CPU")
     parser.add_argument("--repeats", type=int, default=3, help="rounds")
     parser.add_argument("--seconds", type=float, default=0.7, help="of timed passes per turn")

@@ -90,15 +90,22 @@ def resolve_precision(precision: str, accelerator: str) -> Arithmetic:
     return Arithmetic("32-true", tf32=on_cuda) if precision in ("fast", "tf32") else Arithmetic(precision)
 
 
+def set_float32_products(*, tf32: bool) -> None:
+    """Compute products of float32 matrices, and convolutions, in TF32 on NVIDIA GPUs, or not, from now on."""
+    import torch
+
+    torch.set_float32_matmul_precision("high" if tf32 else "highest")
+    torch.backends.cudnn.allow_tf32 = tf32
+
+
 @contextmanager
 def float32_products(*, tf32: bool) -> Iterator[None]:
-    """Compute products of float32 matrices, and convolutions, in TF32 on NVIDIA GPUs, or not."""
+    """The same for a while."""
     import torch
 
     before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
     try:
-        torch.set_float32_matmul_precision("high" if tf32 else "highest")
-        torch.backends.cudnn.allow_tf32 = tf32
+        set_float32_products(tf32=tf32)
         yield
     finally:
         torch.set_float32_matmul_precision(before[0])

@@ -41,9 +41,10 @@ def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda
     Raises HudepthError if the network cannot be built, or nothing could be measured.
     """
     assert plan.threads
+    assert plan.backends
     torch.set_num_threads(plan.threads)
     session = Session(plan.batches, plan.repeats, plan.seconds, plan.longest_pass)
-    rates: list[float] = []
+    rates: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="hudepth-bench-") as made:
         subject = make_subject(plan, Path(made), runs=runs)
         log.info(
@@ -66,8 +67,9 @@ def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda
     return measured
 
 
-def _measure_product(contenders: Contenders, session: Session, rates: list[float]) -> Callable[[], None]:
-    """Return a function that adds the rate of a matrix product to ``rates``, until that fails."""
+def _measure_product(contenders: Contenders, session: Session, rates: dict[str, list[float]]) -> Callable[[], None]:
+    """Return a function that adds the rates of matrix products to ``rates``, by precision, until that fails."""
+    precisions = dict.fromkeys(entry.yardstick for entry in contenders.entries if entry.yardstick)
     workers = []
     try:
         workers.append(contenders.product())
@@ -77,7 +79,8 @@ def _measure_product(contenders: Contenders, session: Session, rates: list[float
     def measure_rate() -> None:
         for worker in list(workers):
             try:
-                rates.append(worker.matmul_gflop_per_s())
+                for precision in precisions:
+                    rates.setdefault(precision, []).append(worker.matmul_gflop_per_s(precision))
             except ContenderError as error:
                 workers.remove(worker)
                 session.note("matrix product", f"no longer measured: {error}")

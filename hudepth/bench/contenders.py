@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hudepth.bench.backends import BACKENDS, GRAPHS, ONNX, PRODUCT, missing
+from hudepth.bench.backends import BACKENDS, GRAPHS, ON_GPU, ONNX, PRODUCT, lacking
 from hudepth.bench.images import images_file
 from hudepth.bench.rows import Entry
 from hudepth.bench.subject import Subject
@@ -41,17 +41,25 @@ class Contenders:
         self._stack.close()
 
     def enter(self, backends: Sequence[str]) -> None:
-        """Start the processes of :data:`hudepth.bench.backends.BACKENDS`; a backend that is not installed is a note."""
+        """Start the processes of :data:`hudepth.bench.backends.BACKENDS`; what is lacking is a note."""
         subject = self.subject
         for name in backends:
             backend = BACKENDS[name]
-            if line := missing(backend.packages, backend.extras):
+            if line := lacking(backend, self.device):
                 self.note(name, line)
                 continue
-            options = {**self._network_options(), **backend.options}
+            options = {**self._network_options(), "precision": backend.precision, **backend.options}
+            if backend.provider:
+                options["provider"] = backend.provider
             if backend.graph is not None:
                 options["graph"] = str(self.folder / backend.graph)
-            entry = Entry(name, name, subject.size, backend.about, subject.parameters, subject.flops)
+            yardstick: str | None = "float32"
+            if self.device == "cuda":  # what runs on the CPU has none there
+                yardstick = backend.precision if name in ON_GPU else None
+            entry = Entry(
+                name, name, subject.size, backend.about, subject.parameters, subject.flops,
+                precision=backend.precision, yardstick=yardstick,
+            )  # fmt: skip
             self.start(entry, backend.factory, options)
 
     def start(self, entry: Entry, factory: str, options: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.files import output_folder
 from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Choice, Range, Size, parse
-from hudepth.bench.backends import BACKENDS, REFERENCE
+from hudepth.bench.backends import BACKENDS, ON_CPU, ON_GPU, REFERENCE
 
 SETTINGS = ("backends", "batches", "repeats", "seconds", "longest_pass", "threads", "device")
 """The options that bench.json states."""
@@ -21,10 +21,10 @@ class Plan:
     """What to measure, and how; conf/bench.yaml explains each option."""
 
     output: Path
-    backends: list[Annotated[str, Choice(tuple(BACKENDS))]]
-    """In the order of the table, :data:`hudepth.bench.backends.REFERENCE` among them."""
     batches: list[Annotated[int, Range(1)]]
     """Rising."""
+    backends: list[Annotated[str, Choice(tuple(BACKENDS))]] | None = None
+    """In the order of the table, :data:`hudepth.bench.backends.REFERENCE` among them; None: those of the device."""
     checkpoint: str | None = None
     model: dict[str, Any] | None = None
     size: Size | None = None
@@ -44,7 +44,8 @@ class Plan:
         if not self.batches:
             raise ConfigError("batches: the list is empty. Pass batches=[1,4].")
         self.device = torch_device(self.device, among=("cuda", "cpu")).type
-        self.backends = [name for name in BACKENDS if name == REFERENCE or name in self.backends]
+        wanted = self.backends if self.backends is not None else ON_GPU if self.device == "cuda" else ON_CPU
+        self.backends = [name for name in BACKENDS if name == REFERENCE or name in wanted]
         self.batches, self.threads = sorted(set(self.batches)), self.threads or usable_cores()
 
 

@@ -12,6 +12,7 @@ from hudepth import __version__
 from hudepth.base.files import write_json, write_text
 from hudepth.base.machine import hardware
 from hudepth.base.tables import Table, stdout
+from hudepth.bench.paper import describe_paper
 from hudepth.bench.plan import SETTINGS, Plan
 from hudepth.bench.plot import draw_bench
 from hudepth.bench.rounds import Session
@@ -23,46 +24,54 @@ LEGEND = (
     "ms/image and images/s are those of the median pass; p50, p25-p75 and p95 are quantiles of a pass [ms]; x eager is "
     "images/s relative to this model in eager mode, the median over rounds in which both ran; MB is the peak memory of "
     "the process, libraries included; GFLOP/s and % peak count the operations of the network as trained (nominal), "
-    "% peak relative to the best single-precision matrix product of the same run: a yardstick and not a bound, since "
-    "operations that merging saves are counted; diff is the largest difference from eager at any pixel."
+    "% peak relative to the best matrix product of the same run, in single precision or, on a GPU, in the contender's: "
+    "a yardstick and not a bound, since operations that merging saves are counted; diff is the largest difference from "
+    "eager at any pixel."
 )
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A finished run; ``rates`` [GFLOP/s] of matrix products are one per round."""
+    """A finished run; ``rates`` [GFLOP/s] of matrix products are one per round and precision."""
 
     plan: Plan
     subject: Subject
     entries: list[Entry]
     session: Session
-    rates: list[float]
+    rates: dict[str, list[float]]
 
     @property
-    def peak_gflop_per_s(self) -> float | None:
-        """The best rate; None if it was not measured."""
-        return max(self.rates, default=None)
+    def peaks(self) -> dict[str, float]:
+        """The best rates, by precision."""
+        return {precision: max(rates) for precision, rates in self.rates.items()}
 
     def rows(self) -> list[Row]:
         """Return the rows of the table."""
-        peak, max_depth_m = self.peak_gflop_per_s, self.subject.max_depth_m
-        return make_rows(self.session.samples, self.entries, peak_gflop_per_s=peak, max_depth_m=max_depth_m)
+        max_depth_m = self.subject.max_depth_m
+        return make_rows(self.session.samples, self.entries, peaks=self.peaks, max_depth_m=max_depth_m)
 
 
 def write_report(measured: Measured, *, sentences: Sequence[str] = ()) -> None:
     """Write all files, print table, notes and further ``sentences``; raises OSError if the folder is full or gone."""
     plan, subject, rows = measured.plan, measured.subject, measured.rows()
-    best = describe_efficiency(rows, peak_gflop_per_s=measured.peak_gflop_per_s, merged_flops=subject.merged_flops)
+    peak = measured.peaks.get("float32")
+    best = describe_efficiency(rows, peak_gflop_per_s=peak, merged_flops=subject.merged_flops)
     lines = [*([best] if best else []), *sentences]
     notes = [*_about(measured), *measured.session.notes]
-    machine = hardware() | ({"gpu": torch.cuda.get_device_name()} if plan.device == "cuda" else {})
+    machine = hardware()
+    if plan.device == "cuda":
+        machine["gpu"] = torch.cuda.get_device_name()
+        lines += describe_paper(rows, name=subject.name, gpu=machine["gpu"])
     height, width = subject.size
     table = bench_table(rows, f"{subject.name}, {height} x {width}, threads: {plan.threads}")
     content = {**_content(measured), "machine": machine, "sentences": lines, "notes": notes}
     write_json(plan.output / "bench.json", {**content, "rows": [asdict(row) for row in rows]})
     write_text(plan.output / "bench.csv", to_csv(rows))
     write_text(plan.output / "bench.md", to_page(table, machine=machine, lines=[*lines, *notes]))
-    save_figure(plan.output / "bench.png", draw_bench(rows, title=f"{table.title}, on {machine['processor']}"))
+    save_figure(
+        plan.output / "bench.png",
+        draw_bench(rows, title=f"{table.title}, on {machine.get('gpu', machine['processor'])}"),
+    )
     table.show()
     for line in (LEGEND, *lines, *notes):
         stdout().print(line, markup=False, highlight=False)
@@ -105,8 +114,9 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in machine["packages"].items() if version)
     memory = f"{machine['memory_gb']:.0f} GB, " if machine["memory_gb"] else ""
     sets = " ".join(machine["instruction_sets"]) or "instruction sets unknown"
+    gpu = f"{machine['gpu']}; " if machine.get("gpu") else ""
     return (
-        f"{machine['processor']}, {machine['cores']} cores of which {machine['usable_cores']} may be used, {memory}"
+        f"{gpu}{machine['processor']}, {machine['cores']} cores of which {machine['usable_cores']} may be used, {memory}"
         f"{sets}; {machine['system']}, Python {machine['python']}, {versions}"
     )
 
@@ -124,7 +134,9 @@ def _content(measured: Measured) -> dict[str, Any]:
         "hudepth": __version__,
         "model": {**model, "trained": measured.plan.checkpoint is not None},
         "settings": {key: settings[key] for key in SETTINGS},
-        "matmul_gflop_per_s": {"best": measured.peak_gflop_per_s, "of_each_round": measured.rates},
+        "matmul_gflop_per_s": {
+            precision: {"best": max(rates), "of_each_round": rates} for precision, rates in measured.rates.items()
+        },
         "times_s": [
             {"contender": sample.name, "batch": sample.batch, "rounds": sample.rounds}
             for sample in measured.session.samples
@@ -144,7 +156,9 @@ def _about(measured: Measured) -> list[str]:
         lines.append("Random weights: they do not change the speed; the depth means nothing.")
     if measured.plan.device == "cuda":
         lines.append(
-            "Contenders in PyTorch ran on the GPU, where MB is the peak memory of their tensors; all others ran on the "
-            "CPU. PyTorch uses TF32 for convolutions, but not for matrix products, on GPUs that have it."
+            "PyTorch, onnxruntime_cuda and tensorrt ran on the GPU, where images and depth stay; all others ran on the "
+            "CPU. For PyTorch, MB is the peak memory of its tensors. float32 is without TF32."
         )
+        peaks = ", ".join(f"{name} {rate / 1000:.1f}" for name, rate in measured.peaks.items())
+        lines.append(f"Matrix products here [TFLOP/s]: {peaks}.")
     return lines + [f"{entry.name}: {entry.about}." for entry in measured.entries]

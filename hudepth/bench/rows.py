@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,10 @@ class Entry:
     """Per image, of the network as trained."""
     kind: str = "backend"
     """``backend`` of the measured network, or ``peer``: another network."""
+    precision: str = "float32"
+    """What it computes in."""
+    yardstick: str | None = "float32"
+    """The precision of the matrix product that it is compared with; None if it runs on another device."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +62,12 @@ class Row:
     gflop_per_s: float | None
     share_of_peak: float | None
     """gflop_per_s relative to the machine's matrix products."""
+    precision: str
 
     @property
     def exact(self) -> bool:
-        """Whether the depth is that of the reference."""
-        return self.difference_mm is not None and self.difference_mm <= EXACT_MM
+        """Whether the depth is that of the reference, and not by chance."""
+        return self.precision == "float32" and self.difference_mm is not None and self.difference_mm <= EXACT_MM
 
     @property
     def speed(self) -> float:
@@ -71,16 +76,16 @@ class Row:
 
 
 def make_rows(
-    samples: Sequence[Sample], entries: Sequence[Entry], *, peak_gflop_per_s: float | None, max_depth_m: float
+    samples: Sequence[Sample], entries: Sequence[Entry], *, peaks: Mapping[str, float], max_depth_m: float
 ) -> list[Row]:
     """Return a row for each sample (of at least one round), by batch, then in the order of ``entries``.
 
-    ``peak_gflop_per_s`` is the best rate of matrix products, None if it was not measured; ``max_depth_m`` is the
-    maximum depth [m]: the network predicts depth / max_depth_m.
+    ``peaks`` are the best rates [GFLOP/s] of matrix products, by precision; ``max_depth_m`` is the maximum depth [m]:
+    the network predicts depth / max_depth_m.
     """
     by_place = {(sample.batch, sample.name): sample for sample in samples}
     return [
-        _row(by_place[place], entry, by_place.get((batch, REFERENCE)), peak_gflop_per_s, max_depth_m)
+        _row(by_place[place], entry, by_place.get((batch, REFERENCE)), peaks.get(entry.yardstick or ""), max_depth_m)
         for batch in sorted({sample.batch for sample in samples})
         for entry in entries
         if (place := (batch, entry.name)) in by_place
@@ -99,6 +104,7 @@ def _row(sample: Sample, entry: Entry, reference: Sample | None, peak: float | N
         difference_mm=_difference_mm(sample, reference, max_depth_m) if entry.kind == "backend" else None,
         gflop_per_image=None if entry.flops is None else entry.flops / 1e9,
         gflop_per_s=work, share_of_peak=None if work is None or peak is None else work / peak,
+        precision=entry.precision,
     )  # fmt: skip
 
 

@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hudepth.base.instantiate import instantiate
+from hudepth.base.machine import set_float32_products
 from hudepth.bench.worker import Runner, Spec
-from hudepth.models.inference import inference_form
+from hudepth.cuda import graphs
+from hudepth.models.inference import HalfForm, inference_form
 
-MATRIX, PRODUCTS = 2048, 3
-"""Side of the matrices whose product measures the machine, and how many products are timed."""
+MATRIX = {"cpu": 2048, "cuda": 8192}
+"""Side of the matrices whose product measures the machine: on a GPU, smaller ones do not reach its rate."""
+PRODUCTS = 3
+"""How many products are timed."""
 
 
 class TorchRunner(Runner):
@@ -65,13 +69,41 @@ class CompiledRunner(TorchRunner):
         self.net = torch.compile(self.plain, dynamic=False)  # type: ignore[assignment]
 
 
-class ProductRunner(TorchRunner):
-    """The product of two single-precision matrices, which measures the machine."""
+class ReplayedRunner(TorchRunner):
+    """A network on a GPU, recorded for each batch size as a CUDA graph."""
+
+    def __init__(self, net: nn.Module, *, device: torch.device, channels_last: bool) -> None:
+        super().__init__(net, device=device, channels_last=channels_last)
+        self.recording: graphs.Recording | None = None
 
     @torch.inference_mode()
-    def matmul_gflop_per_s(self) -> float:
-        """Return the best rate of several products."""
-        matrix = torch.ones(MATRIX, MATRIX, device=self.device)
+    def load(self, images: NDArray[np.float32]) -> None:
+        """Set the batch, and record a pass of it."""
+        self.recording = self.output = None  # the last batch's memory would count
+        super().load(images)
+        with graphs.beside():
+            for _ in range(graphs.WARM_UPS):
+                self.net(self.images)
+        self.recording = graphs.record(lambda: self.net(self.images))
+        self.output = self.recording.results
+
+    def run(self) -> None:
+        """Compute one pass."""
+        assert self.recording is not None
+        self.recording.replay()
+        self._wait()
+
+
+class ProductRunner(TorchRunner):
+    """The product of two square matrices, which measures the machine."""
+
+    @torch.inference_mode()
+    def matmul_gflop_per_s(self, precision: str) -> float:
+        """Return the best rate of several products in ``float32``, ``tf32``, ``float16`` or ``bfloat16``."""
+        side = MATRIX[self.device.type]
+        dtype = torch.float32 if precision == "tf32" else getattr(torch, precision)
+        set_float32_products(tf32=precision == "tf32")
+        matrix = torch.rand(side, side, device=self.device).to(dtype)  # ones would take less power, and run faster
         times = []
         for _ in range(1 + PRODUCTS):
             self._wait()
@@ -79,7 +111,7 @@ class ProductRunner(TorchRunner):
             torch.mm(matrix, matrix)
             self._wait()
             times.append(time.perf_counter() - start)
-        return 2 * MATRIX**3 / min(times[1:]) / 1e9
+        return 2 * side**3 / min(times[1:]) / 1e9
 
 
 def product(spec: Spec) -> ProductRunner:
@@ -89,15 +121,24 @@ def product(spec: Spec) -> ProductRunner:
 
 
 def network(spec: Spec) -> TorchRunner:
-    """Run the network; options ``merged`` (as hudepth-predict does), ``channels_last`` and ``compile``."""
+    """Run the network.
+
+    Options are ``merged`` (as hudepth-predict does), ``channels_last``, ``compile``, ``replayed`` (on a GPU) and
+    ``precision``: ``float32`` (the default, without TF32), ``tf32``, ``float16`` or ``bfloat16``.
+    """
     device, channels_last = _device(spec), bool(spec.options.get("channels_last"))
+    precision = spec.options.get("precision", "float32")
+    set_float32_products(tf32=precision == "tf32")
     net = build_merged(spec) if spec.options.get("merged") else build_net(spec)
     if spec.options.get("compile"):
         os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # else it keeps idle processes alive
         return CompiledRunner(net, device=device, channels_last=channels_last)
     if channels_last:
         net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return TorchRunner(net, device=device, channels_last=channels_last)
+    if precision in ("float16", "bfloat16"):
+        net = HalfForm(net, getattr(torch, precision))
+    kind = ReplayedRunner if spec.options.get("replayed") else TorchRunner
+    return kind(net, device=device, channels_last=channels_last)
 
 
 def build_net(spec: Spec) -> nn.Module:

@@ -109,9 +109,9 @@ class Worker(AbstractContextManager["Worker"]):
         """Return the peak memory [MB] since the last :meth:`begin`."""
         return float(self._ask("peak_mb"))
 
-    def matmul_gflop_per_s(self) -> float:
+    def matmul_gflop_per_s(self, precision: str) -> float:
         """Return the best rate of several matrix products; only for :data:`hudepth.bench.backends.PRODUCT`."""
-        return float(self._ask("matmul_gflop_per_s"))
+        return float(self._ask("matmul_gflop_per_s", precision))
 
     def dismiss(self) -> None:
         """Let the process end after its current command, without waiting for it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,16 @@ KEY = "hudepth"  # under which exported files carry the description of their mod
 OPENVINO_PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}  # and its names for them; bfloat16 is not exact
 
 
-def onnx_session(path: Path, *, threads: int) -> Any:
-    """Open an ONNX file on the CPU; raises ConfigError if ONNX Runtime is missing, and what that raises itself."""
+def onnx_session(path: Path, *, threads: int, providers: Sequence[Any] = ("CPUExecutionProvider",)) -> Any:
+    """Open an ONNX file, on the CPU unless ``providers`` are others.
+
+    Raises ConfigError if ONNX Runtime is missing, and what that raises itself.
+    """
     runtime = package("onnxruntime", extra="onnx")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3  # errors
-    return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return runtime.InferenceSession(str(path), options, providers=list(providers))
 
 
 def openvino_model(path: Path, *, threads: int, precision: str) -> tuple[Any, Any]:

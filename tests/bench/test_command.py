@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
@@ -13,6 +14,7 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.options import plain
 from hudepth.base.verbs import conf_folder
 from hudepth.bench import backends
+from hudepth.bench.backends import ON_CPU, ON_GPU
 from hudepth.bench.plan import make_plan
 from hudepth.bench.rows import Row
 from tests.commands import Command, script
@@ -37,8 +39,10 @@ def test_the_installed_script_measures_from_any_folder(tmp_path: Path, cache: Pa
     assert content["model"]["parameters"] == 8217
     assert content["settings"]["batches"] == [1, 2]
     assert content["machine"]["packages"]["onnxruntime"]
-    assert len(content["matmul_gflop_per_s"]["of_each_round"]) == 4
-    assert content["matmul_gflop_per_s"]["best"] == max(content["matmul_gflop_per_s"]["of_each_round"])
+    (product,) = content["matmul_gflop_per_s"].items()
+    assert product[0] == "float32"
+    assert len(product[1]["of_each_round"]) == 4
+    assert product[1]["best"] == max(product[1]["of_each_round"])
     assert {len(entry["rounds"]) for entry in content["times_s"]} == {2}
     page = (folder / "bench.md").read_text()
     assert all(line in page for line in (*content["sentences"], *content["notes"]))
@@ -78,6 +82,19 @@ def test_a_checkpoint_is_measured_whatever_fails_beside_it(
     assert installed == "onnxruntime: left out, since absent cannot be imported. Run pip install 'hudepth[onnx]'."
     assert built.startswith("compile: cannot be built: AttributeError")
     assert installed in " ".join(done.out.split())
+
+
+@pytest.mark.parametrize(("device", "backends"), [("cpu", ON_CPU), ("cuda", ON_GPU)])
+def test_what_is_measured_depends_on_the_device(
+    device: str, backends: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hudepth.bench.plan.torch_device", lambda *_, **__: torch.device(device))
+    with initialize_config_dir(str(conf_folder()), version_base=None):
+        config = plain(compose("bench", [*TINY, f"output={tmp_path / 'bench'}"]))
+    assert make_plan(config).backends == backends
+    comment = (conf_folder() / "bench.yaml").read_text()
+    assert f"[{', '.join(backends)}]" in comment
+    assert make_plan({**config, "backends": ["bf16"]}).backends == ["eager", "bf16"]
 
 
 MISTAKES = [

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from hudepth.bench import contenders as module
-from hudepth.bench.backends import BACKENDS, GRAPHS, PRODUCT, missing
+from hudepth.bench.backends import BACKENDS, GRAPHS, ON_CPU, ON_GPU, PRODUCT, missing
 from hudepth.bench.contenders import Contenders
 from hudepth.bench.subject import Subject
 from hudepth.bench.worker import ContenderError, Spec, Worker
@@ -66,12 +68,41 @@ def test_what_cannot_be_built_is_a_note_and_the_rest_is_there(
 ) -> None:
     monkeypatch.setattr(FakeWorker, "broken", ("default", "int8.xml"))
     with entered as contenders:
-        contenders.enter(list(BACKENDS))
-        assert len(contenders.started) == len(BACKENDS) == sum(1 for _ in contenders.build())
+        contenders.enter(ON_CPU)
+        assert len(contenders.started) == len(ON_CPU) == sum(1 for _ in contenders.build())
     assert [worker.name for worker in contenders.workers] == [entry.name for entry in contenders.entries]
-    left = [name for name in BACKENDS if name not in ("default", "int8")]
+    left = [name for name in ON_CPU if name not in ("default", "int8")]
     assert [entry.name for entry in contenders.entries] == left
     assert notes == [
         ("default", "cannot be built: no memory"),
         ("int8", "cannot be built: no memory"),
     ]
+
+
+def test_what_needs_a_gpu_is_left_out_without_one(entered: Contenders, notes: list[tuple[str, str]]) -> None:
+    with entered as contenders:
+        contenders.enter(["eager", "cuda_graph", "bf16", "tensorrt"])
+        assert [entry.name for _, entry in contenders.started] == ["eager"]
+    line = "left out, since it needs an NVIDIA GPU and device=cuda."
+    assert notes == [(name, line) for name in ("cuda_graph", "bf16", "tensorrt")]
+
+
+def test_on_a_gpu_each_has_the_yardstick_of_its_precision(
+    entered: Contenders, notes: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime = SimpleNamespace(get_available_providers=lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
+    monkeypatch.setitem(sys.modules, "onnxruntime", runtime)  # type: ignore[arg-type]
+    monkeypatch.setattr("hudepth.bench.backends.missing", lambda *_: "")
+    entered.device = "cuda"
+    with entered as contenders:
+        contenders.enter([*ON_GPU, "openvino"])
+        yardsticks = {entry.name: entry.yardstick for _, entry in contenders.started}
+        options = {worker.name: worker.spec.options for worker, _ in contenders.started}
+    plain = dict.fromkeys(("eager", "channels_last", "default", "cuda_graph", "compile", "onnxruntime_cuda"), "float32")
+    assert yardsticks == {**plain, "tf32": "tf32", "fp16": "float16", "bf16": "bfloat16", "openvino": None}
+    (left_out,) = notes
+    assert left_out[0] == "tensorrt"
+    assert "no TensorrtExecutionProvider here. Run pip" in left_out[1]
+    assert options["onnxruntime_cuda"]["provider"] == "CUDAExecutionProvider"
+    assert options["fp16"]["precision"] == "float16"
+    assert options["fp16"]["replayed"]

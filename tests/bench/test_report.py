@@ -24,6 +24,7 @@ def test_the_page_has_machine_table_and_notes() -> None:
     page = to_page(table, machine=MACHINE, lines=["A.", "n"])
     assert page.startswith("# T\n")
     assert "On P, 4 cores of which 2 may be used, 8 GB, avx2; Linux, Python 3.11, torch 2.6." in page
+    assert "On NVIDIA H200; P, 4 cores" in to_page(table, machine={**MACHINE, "gpu": "NVIDIA H200"}, lines=[])
     lines = [line for line in page.splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in lines}) == 1
     assert "| 1 | default | 0.81 | 1235 |" in page

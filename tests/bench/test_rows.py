@@ -30,12 +30,12 @@ def entry(name: str) -> Entry:
 def rows_of(**passes_s: float) -> list[Row]:
     """Backends at batch 1, by the seconds of a pass."""
     samples = [sample(name, 1, pass_s) for name, pass_s in passes_s.items()]
-    return make_rows(samples, [entry(name) for name in passes_s], peak_gflop_per_s=100.0, max_depth_m=10.0)
+    return make_rows(samples, [entry(name) for name in passes_s], peaks={"float32": 100.0}, max_depth_m=10.0)
 
 
 def test_a_row_from_its_times() -> None:
     samples = [sample("eager", 4, 0.8), sample("openvino", 4, 0.2, depth=0.5001)]
-    first, second = make_rows(samples, [entry("eager"), entry("openvino")], peak_gflop_per_s=100.0, max_depth_m=10.0)
+    first, second = make_rows(samples, [entry("eager"), entry("openvino")], peaks={"float32": 100.0}, max_depth_m=10.0)
     assert (first.ms_per_image, first.images_per_s, first.p50_ms, first.passes) == pytest.approx((200, 5, 800, 3))
     assert (first.times_eager, first.difference_mm) == (1.0, 0.0)
     assert second.times_eager == pytest.approx(4)
@@ -47,19 +47,19 @@ def test_a_row_from_its_times() -> None:
 @given(st.integers(1, 10**12), st.floats(1e-4, 1e2), st.integers(1, 64), st.floats(1, 1e5))
 def test_share_of_peak(flops: int, pass_s: float, batch: int, peak: float) -> None:
     known = replace(entry("eager"), flops=flops)
-    (row,) = make_rows([sample("eager", batch, pass_s)], [known], peak_gflop_per_s=peak, max_depth_m=10.0)
+    (row,) = make_rows([sample("eager", batch, pass_s)], [known], peaks={"float32": peak}, max_depth_m=10.0)
     assert row.share_of_peak == pytest.approx(flops * batch / pass_s / (peak * 1e9))
 
 
 def test_rows_go_by_batch_then_by_entry() -> None:
     samples = [sample("b", 2, 1), sample("eager", 2, 1), sample("b", 1, 1), sample("eager", 1, 1)]
-    rows = make_rows(samples, [entry("eager"), entry("b")], peak_gflop_per_s=None, max_depth_m=10.0)
+    rows = make_rows(samples, [entry("eager"), entry("b")], peaks={}, max_depth_m=10.0)
     assert [(row.batch, row.contender) for row in rows] == [(1, "eager"), (1, "b"), (2, "eager"), (2, "b")]
     assert rows[0].share_of_peak is None
 
 
 def test_without_the_reference_there_is_nothing_to_compare_with() -> None:
-    (row,) = make_rows([sample("openvino", 1, 1)], [entry("openvino")], peak_gflop_per_s=None, max_depth_m=10.0)
+    (row,) = make_rows([sample("openvino", 1, 1)], [entry("openvino")], peaks={}, max_depth_m=10.0)
     assert row.times_eager is None
     assert row.difference_mm is None
     assert not row.exact
@@ -67,7 +67,7 @@ def test_without_the_reference_there_is_nothing_to_compare_with() -> None:
 
 def test_a_depth_that_is_no_number_is_not_exact() -> None:
     samples = [sample("eager", 1, 1), sample("b", 1, 1, depth=float("nan"))]
-    rows = make_rows(samples, [entry("eager"), entry("b")], peak_gflop_per_s=None, max_depth_m=10.0)
+    rows = make_rows(samples, [entry("eager"), entry("b")], peaks={}, max_depth_m=10.0)
     assert [row.exact for row in rows] == [True, False]
 
 
@@ -90,6 +90,15 @@ def quantile(values: list[float], share: float) -> float:
     below = math.floor(place)
     above = min(below + 1, len(ordered) - 1)
     return ordered[below] + (place - below) * (ordered[above] - ordered[below])
+
+
+def test_each_row_is_compared_with_the_product_of_its_precision() -> None:
+    kinds = {"eager": "float32", "fp16": "float16", "elsewhere": None}
+    entries = [replace(entry(name), yardstick=kind, precision=kind or "float32") for name, kind in kinds.items()]
+    samples = [sample(name, 1, 0.1) for name in kinds]
+    rows = make_rows(samples, entries, peaks={"float32": 100.0, "float16": 800.0}, max_depth_m=10.0)
+    assert [row.share_of_peak for row in rows] == [pytest.approx(0.2), pytest.approx(0.025), None]
+    assert [row.exact for row in rows] == [True, False, True]  # what is not float32 is exact by chance only
 
 
 @given(ROUNDS)

@@ -9,11 +9,12 @@ import torch
 from torch import nn
 
 from hudepth.bench.images import COUNT, images_file
-from hudepth.bench.torch_runners import TorchRunner, network, product
+from hudepth.bench.torch_runners import ReplayedRunner, TorchRunner, network, product
 from hudepth.bench.worker import Spec
 from hudepth.models.cost import counted_flops, image_flops
 from hudepth.models.hybrid_unet import HybridUNet
 from hudepth.models.inference import inference_form
+from tests.devices import with_graphs
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,25 @@ def test_operations_are_those_of_the_counter_in_any_form(net: nn.Module) -> None
 
 
 def test_the_machine_is_measured(spec: Spec) -> None:
-    assert 0.1 < product(spec).matmul_gflop_per_s() < 1e6
+    for precision in ("float32", "tf32", "bfloat16"):
+        assert 0.1 < product(spec).matmul_gflop_per_s(precision) < 1e6
+
+
+def test_replayed_passes_are_the_usual_ones(spec: Spec) -> None:
+    images = np.load(spec.images)
+    merged = {"merged": True, "channels_last": True}
+    with with_graphs():
+        for precision, most in (("float32", 0), ("tf32", 0), ("float16", 2**-10), ("bfloat16", 2**-7)):
+            usual = network(replace(spec, options={**spec.options, **merged}))
+            replayed = network(
+                replace(spec, options={**spec.options, **merged, "replayed": True, "precision": precision})
+            )
+            assert isinstance(replayed, ReplayedRunner)
+            for batch in (images[:2], images[2:5], images[:2]):
+                for runner in (usual, replayed):
+                    runner.load(batch)
+                    runner.run()
+                assert np.abs(replayed.result() - usual.result()).max() <= most
 
 
 def test_images_are_written_once(tmp_path: Path) -> None:
