@@ -115,8 +115,8 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
     memory = f"{machine['memory_gb']:.0f} GB, " if machine["memory_gb"] else ""
     sets = " ".join(machine["instruction_sets"]) or "instruction sets unknown"
     gpu = f"{machine['gpu']}; " if machine.get("gpu") else ""
-    return (
-        f"{gpu}{machine['processor']}, {machine['cores']} cores of which {machine['usable_cores']} may be used, {memory}"
+    return gpu + (
+        f"{machine['processor']}, {machine['cores']} cores of which {machine['usable_cores']} may be used, {memory}"
         f"{sets}; {machine['system']}, Python {machine['python']}, {versions}"
     )
 
