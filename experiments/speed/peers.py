@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from experiments.speed.mobile_unet import MobileUNet
+from hudepth.base.machine import set_float32_products
 from hudepth.bench.torch_runners import TorchRunner
 from hudepth.bench.worker import Spec
 from hudepth.models.cost import image_flops, parameters
@@ -106,6 +107,7 @@ class PeerRunner(TorchRunner):
 
     def __init__(self, spec: Spec) -> None:
         torch.set_num_threads(spec.threads)
+        set_float32_products(tf32=False)  # as this model's are
         self.size: Size = spec.options["size"]
         net = PEERS[spec.options["peer"]].build(self.size).eval().requires_grad_(requires_grad=False)
         super().__init__(net, device=torch.device(spec.options["device"]), channels_last=False)
