@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.options import plain
-from hudepth.base.verbs import SUBCOMMANDS, commands, conf_folder, module_of, options_of
+from hudepth.base.verbs import OWN_COMMAND, SUBCOMMANDS, commands, conf_folder, module_of, options_of
 from hudepth.base.wording import LAUNCHERS, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
@@ -186,7 +186,9 @@ def _run_hydra(task: str) -> int:
 
         setup_logging()
         try:
-            run: Callable[[Any], Any] = getattr(importlib.import_module(module_of(task)), task)
+            verb = str(cfg.get("verb") or "")
+            name = verb if (task, verb) in OWN_COMMAND else task
+            run: Callable[[Any], Any] = getattr(importlib.import_module(module_of(name)), name)
             if task == "train":  # which resumes runs by what Hydra was given
                 return run(cfg)
             return run({**plain(cfg), "overrides": list(HydraConfig.get().overrides.task)})

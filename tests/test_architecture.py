@@ -18,11 +18,11 @@ LEVELS = (
     {"runs", "viz"},
     {"data"},
     {"training", "inference", "evaluation"},
-    {"sweep", "export", "bench", "demo", "report"},
+    {"sweep", "export", "calibrate", "bench", "demo", "report"},
     {"cli", "help"},
 )
 """From the bottom up: a package imports from levels below its own."""
-SIDEWAYS = {("training", "evaluation"), ("bench", "export"), ("cli", "help")}
+SIDEWAYS = {("training", "evaluation"), ("bench", "export"), ("calibrate", "export"), ("cli", "help")}
 """The arrows within a level."""
 HYDRA = ("cli", "base.wording", "base.options", "sweep.", "training.command")
 """Modules that may know Hydra and OmegaConf."""

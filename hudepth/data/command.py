@@ -1,4 +1,4 @@
-"""hudepth-data: prepare a depth store, describe a data set, or audit it."""
+"""hudepth-data: prepare a depth store, describe a data set, or audit it. ``calibrate`` is in hudepth.calibrate."""
 
 from __future__ import annotations
 

@@ -43,6 +43,8 @@ def test(config: dict[str, Any]) -> None:
         raise ConfigError(f"checkpoint is not set. Pass {places}.")
     checkpoint = load_checkpoint(options.checkpoint, runs=options.paths["runs"])
     log.info("checkpoint: %s, after %d epochs on %s", checkpoint.path, checkpoint.epoch, checkpoint.data.get("source"))
+    if "calibration" in checkpoint.data:
+        log.warning("checkpoint: its calibration is left out: the network is scored as it was trained")
     # An untrusted checkpoint may choose what to read, but not where to write.
     overrides = {"cache": options.paths["cache"], **(options.data or {})}
     datamodule, other_data = open_data(checkpoint, overrides, typed=config["overrides"], trust=options.trust)

@@ -37,13 +37,14 @@ def model_card(
         info: its inputs and outputs.
         name: of the model.
         results: contents of ``metrics.json`` by protocol; may be empty.
-        parity: the difference between the checkpoint and the ONNX file or 16-bit weights, in words.
+        parity: the difference between the checkpoint and the ONNX file or 16-bit weights, in words; empty if there is
+            no ONNX file and the weights are the checkpoint's.
         samples: number of sample pictures, which show ``origin``, for example ``test images of nyu_labeled``.
         half: kernels and matrices are stored as 16-bit floats, and there is no ONNX file.
         trust: packages whose data sets may be imported for their terms.
     """
     source, data_set = str(checkpoint.data.get("source", "unknown")), _source_class(checkpoint, trust)
-    tags = ["depth-estimation", "monocular-depth", *["onnx"] * (not half), "hudepth"]
+    tags = ["depth-estimation", "monocular-depth", *["onnx"] * (bool(parity) and not half), "hudepth"]
     sections = (
         f"---\nlibrary_name: hudepth\npipeline_tag: depth-estimation\nlicense: {data_set.licence}\ntags:\n- "
         + "\n- ".join(tags) + f"\n---\n\n# {name}", _about(info), _use(info, parity, half=half),
@@ -69,20 +70,20 @@ def _source_class(checkpoint: Checkpoint, trust: Iterable[str]) -> type[Source]:
 
 def _about(info: ModelInfo) -> str:
     height, width = info.size
+    calibrated = f" It is {info.calibration} (in metres, as the network predicts it)." if info.calibration else ""
     return (
         f"Depth in metres from a single RGB image: {info.name}, {info.parameters:,} parameters, input {height} x "
         f"{width} (height x width), depths up to {info.max_depth_m:g} m. Made with hudepth, which implements "
-        "Turkmen & Akgun (2025)."
+        f"Turkmen & Akgun (2025).{calibrated}"
     )
 
 
 def _use(info: ModelInfo, parity: str, *, half: bool) -> str:
     height, width = info.size
-    if half:
-        files = (
-            "`model.safetensors` holds kernels and matrices as 16-bit floats; computation uses 32 bits. Compared with "
-            f"the trained weights, it is {parity}. `config.json` describes the network."
-        )
+    if half or not parity:
+        kind = "kernels and matrices as 16-bit floats; computation uses 32 bits" if half else "float32 tensors"
+        compared = f" Compared with the trained weights, it is {parity}." if parity else ""
+        files = f"`model.safetensors` holds {kind}.{compared} `config.json` describes the network."
     else:
         files = (
             f"`model.onnx` needs no hudepth: input `image` uint8 [batch, {height}, {width}, 3], RGB, the whole image "

@@ -31,7 +31,7 @@ def export_graph(net: nn.Module, info: ModelInfo) -> tuple[nn.Module, Tensor]:
     height, width = info.size
     if info.processing:
         image = torch.randint(0, 256, (2, height, width, 3), dtype=torch.uint8)
-        return DepthPipeline(net, max_depth_m=info.max_depth_m).eval(), image
+        return DepthPipeline(net, info).eval(), image
     return net, torch.rand(2, 3, height, width)
 
 
@@ -52,6 +52,7 @@ def describe(info: ModelInfo) -> dict[str, str]:
         "input": f"{INPUT}: {image}",
         "output": f"{OUTPUTS[info.processing]}: {depth}",
         **_describe_camera(info),
+        **({"calibration": str(info.calibration)} if info.calibration else {}),
         "max_depth_m": f"{info.max_depth_m:g}",
         "trained_on": json.dumps(info.trained_on, sort_keys=True),
         "producer": f"hudepth {__version__}",

@@ -53,16 +53,21 @@ class Backend(Protocol):
 
 
 class DepthPipeline(nn.Module):
-    """A network (normalised image to depth / ``max_depth_m``) from RGB bytes to metres; the graph that is exported."""
+    """A network (normalised image to depth / ``max_depth_m``) from RGB bytes to metres; the graph that is exported.
 
-    def __init__(self, net: nn.Module, *, max_depth_m: float) -> None:
+    Its calibration is part of it.
+    """
+
+    def __init__(self, net: nn.Module, info: ModelInfo) -> None:
         super().__init__()
-        self.normalise, self.net, self.max_depth_m = NormaliseBytes(), net, max_depth_m
+        self.normalise, self.net = NormaliseBytes(), net
+        self.max_depth_m, self.calibration = info.max_depth_m, info.calibration
 
     def forward(self, image: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b h w"]:
         """Predict depth [m], never below 0."""
         depth: Tensor = self.net(self.normalise(image))[:, 0] * self.max_depth_m
-        return depth.clamp(min=0)
+        depth = depth.clamp(min=0)
+        return depth if self.calibration is None else self.calibration.apply(depth)
 
 
 class TorchBackend:
@@ -79,7 +84,7 @@ class TorchBackend:
     ) -> None:
         self.info, self.device, self.precision = info, device, precision
         form = net if precision == "float32" else HalfForm(net, getattr(torch, precision))
-        self.pipeline = DepthPipeline(form, max_depth_m=info.max_depth_m).to(device)
+        self.pipeline = DepthPipeline(form, info).to(device)
         wanted = graphs.has_graphs(device)
         self._replayed = ArrayGraphs(self._exact, device, what="the network") if wanted else None
 
@@ -126,7 +131,8 @@ class GraphBackend:
         if self.info.processing:
             return np.asarray(self._compute(rgb))
         unit_depth = self._compute(_NORMALISE(torch.from_numpy(rgb)).contiguous().numpy())
-        return np.maximum(unit_depth[:, 0] * np.float32(self.info.max_depth_m), np.float32(0))
+        depth = np.maximum(unit_depth[:, 0] * np.float32(self.info.max_depth_m), np.float32(0))
+        return depth if self.info.calibration is None else self.info.calibration.apply(depth)
 
 
 def _read_info(path: Path, text: str) -> ModelInfo:

@@ -6,7 +6,7 @@ import errno
 import time
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
@@ -95,7 +95,7 @@ def predict(config: dict[str, Any]) -> None:
     model = load_model(options)
     log.info("model: %s; %s, fit=%s", model.info, model.backend.name, model.fit)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
-    job = Job(model, output, Style(options.scale_m or (0.0, model.info.max_depth_m)), options)
+    job = Job(model, output, Style(options.scale_m or (0.0, model.info.farthest_m)), options)
     start = time.monotonic()
     try:
         if inputs.images:
@@ -205,7 +205,8 @@ def _report(job: Job, *, seconds: float) -> None:
         "model": {"name": info.name, "parameters": info.parameters, "epoch": info.epoch, **info.trained_on},
         "units": {"png16": "mm", "npy": "m", "ply": "m"},
         "network_size": list(info.size), "fit": job.model.fit,
-        "max_depth_m": info.max_depth_m, "backend": job.model.backend.name,
+        "max_depth_m": info.max_depth_m,
+        "calibration": info.calibration and asdict(info.calibration), "backend": job.model.backend.name,
         "settings": {
             "input": options.input, "camera": options.camera, "smoothing": options.smoothing,
             "precision": options.precision, "frames": options.frames,

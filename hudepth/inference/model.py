@@ -117,7 +117,7 @@ class DepthModel:
         metres = unfit_depth(depth_m, prepared.fitted.box, (rgb.shape[0], rgb.shape[1]))
         if prepared.factor != 1:
             metres = metres * np.float32(prepared.factor)
-        limit = self.info.max_depth_m * prepared.factor
+        limit = self.info.farthest_m * prepared.factor
         return DepthMap(metres, rgb, limit, prepared.photo.notes, prepared.camera, prepared.factor)
 
 

@@ -10,15 +10,14 @@ from typing import Annotated, Any
 from hudepth.base.camera import NYU_FOCAL, Intrinsics
 from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.options import Range, parse
+from hudepth.inference.calibration import Calibration, Focal
 from hudepth.runs.checkpoint import Checkpoint
 
+CALIBRATION = "calibration"  # key of a calibrated bundle's data
 VERSION = 1  # of the description that exported files carry
 USUAL_ASPECT = 4 / 3  # width over height if a checkpoint does not record it: that of NYU Depth V2 and most sensors
 NYU_SOURCES = ("nyu_labeled", "nyu_mat", "nyu_raw", "densedepth", "rooms")  # taken or rendered with NYU's camera
 MAX_SIDE = 8192  # descriptions that ask for larger images are refused
-
-
-_Focal = Annotated[float, Range(0.1, 20)]
 
 
 @dataclass(frozen=True)
@@ -33,19 +32,31 @@ class ModelInfo:
     epoch: int  # finished epochs of training
     trained_on: dict[str, Any] = field(default_factory=dict)  # source, fingerprint, encoding and split of the data
     aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT  # width over height of the original training images
-    focal: tuple[_Focal, _Focal] | None = None
+    focal: tuple[Focal, Focal] | None = None
     """Focal lengths of the training camera over the sides of its pictures, horizontal and vertical; see
     :attr:`training_focal`."""
+    calibration: Calibration | None = None  # is applied to the metres that the network predicts
     processing: bool = True  # whether a graph maps RGB bytes to metres, else normalised images to unit depth
 
     def __str__(self) -> str:
         source, size = self.trained_on.get("source") or "unknown data", f"{self.size[0]} x {self.size[1]}"
         network = f"{self.name} of {self.parameters:,} parameters"
-        return f"{network}, trained on {source} for {self.epoch} epochs; {size}, up to {self.max_depth_m:g} m"
+        words = f"{network}, trained on {source} for {self.epoch} epochs; {size}, up to {self.farthest_m:.4g} m"
+        return f"{words}; {self.calibration}" if self.calibration else words
+
+    @property
+    def farthest_m(self) -> float:
+        """Largest depth it predicts for a picture of the training camera [m]."""
+        return self.calibration.apply(self.max_depth_m) if self.calibration else self.max_depth_m
 
     @property
     def training_focal(self) -> tuple[float, float] | None:
-        """``focal``, NYU's for its data sets and the rooms; None if the training camera is not known."""
+        """``focal``, NYU's for its data sets and the rooms; None if the training camera is not known.
+
+        Of a calibrated model, the camera that it was calibrated for.
+        """
+        if self.calibration is not None:
+            return self.calibration.focal
         return self.focal or (NYU_FOCAL if self.trained_on.get("source") in NYU_SOURCES else None)
 
     def assumed_camera(self, height: int, width: int) -> Intrinsics:
@@ -53,11 +64,12 @@ class ModelInfo:
 
         It has square pixels, and the field of view of the longer side, where the shapes differ.
         """
-        if self.focal is None:
+        focal = self.focal if self.calibration is None else self.calibration.focal
+        if focal is None or focal == NYU_FOCAL:
             return Intrinsics.of_photo(height, width)
-        fx, fy = self.focal[0] * width, self.focal[1] * height
-        if abs(width / height / self.aspect - 1) >= 0.01:
-            fx = fy = self.focal[int(self.aspect < 1)] * max(height, width)
+        fx, fy = focal[0] * width, focal[1] * height
+        if abs(width / height / (focal[1] / focal[0]) - 1) >= 0.01:
+            fx = fy = min(focal) * max(height, width)
         return Intrinsics.centred(fx, fy, height, width, known=False, origin="the training camera, assumed")
 
     def to_json(self) -> str:
@@ -86,13 +98,15 @@ class ModelInfo:
         try:
             height, width = size or data["size"]
             native = checkpoint.data.get("native_sizes") or []
+            trained_on = {key: value for key, value in checkpoint.data.items() if key != CALIBRATION}
             values = {
                 "name": str(checkpoint.config["model"].get("_target_", "")).rpartition(".")[2],
                 "size": [int(height), int(width)],
                 "max_depth_m": float(data["max_depth_m"]),
                 "parameters": parameters,
                 "epoch": checkpoint.epoch,
-                "trained_on": {**checkpoint.data, "split": checkpoint.split},
+                "trained_on": {**trained_on, "split": checkpoint.split},
+                "calibration": checkpoint.data.get(CALIBRATION),
                 "focal": checkpoint.data.get("focal"),
                 "aspect": native[0][1] / native[0][0] if len(native) == 1 else USUAL_ASPECT,
             }
