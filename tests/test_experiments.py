@@ -9,9 +9,11 @@ import re
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 from experiments.studies import TEXTS
+from hudepth.inference.image_fit import FOCAL_POWERS
 from hudepth.runs.history import read_history
 from hudepth.runs.results import MODEL, find_result
 
@@ -72,6 +74,27 @@ def test_units() -> None:
     assert f"has SSIM {mean['ssim']:.3f}. Read rightly" in text
     assert f"abs_rel {literal['abs_rel']:.3f} against {right['abs_rel']:.3f}" in text
     assert f"rmse came to {literal['rmse']:.3f}" in text
+
+
+def test_field_of_view() -> None:
+    """What is said of cameras is in the table, and the powers that hudepth applies are those that were fitted."""
+    page = (STUDIES / "field_of_view" / "README.md").read_text()
+    _, results, said = page.split("<!-- results -->")
+    fitted = [float(value) for value in re.findall(r"0\.\d+", results.splitlines()[1])]
+    assert np.abs(np.subtract(FOCAL_POWERS, fitted)).max() < 0.02
+    rows = {cells[1].strip(): [float(x) for x in re.findall(r"(0\.\d+) \(", row)]
+            for row in results.splitlines() if len(cells := row.split("|")) > 5}  # fmt: skip
+    (whole,) = rows["all of the image"]
+    same, without, ratio, _, camera, two = rows["half"]
+    for value in (whole, same, without, ratio, camera, two, rows["portrait 3:4"][2], rows["portrait 3:4"][1]):
+        assert f"{value:.3f}" in said
+    assert f"**{100 * (camera / same - 1):.0f} % above it for half**" in said
+    well = ("four fifths of the field of view", "portrait 3:4", "square", "wide 16:9")
+    assert all(rows[name][4] < 1.15 * rows[name][0] for name in well)
+    text = " ".join((STUDIES.parent / "docs" / "deployment.md").read_text().split())
+    near = rows["four fifths of the field of view"]
+    assert f"is {near[4]:.3f} at four fifths of the field of view ({near[1]:.3f} without)" in text
+    assert f"{camera:.3f} at half ({without:.3f} without) and {whole:.3f} on whole images" in text
 
 
 def test_every_result_of_a_study_can_be_read() -> None:
