@@ -6,10 +6,10 @@ import errno
 import time
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 
@@ -42,13 +42,15 @@ class PredictOptions(ModelOptions):
     output: str = "predictions"
     formats: list[Annotated[str, Choice(tuple(FORMATS))]] | None = None
     recursive: bool = False
-    scale_m: Annotated[tuple[float, float], "two rising distances [near,far] in metres"] | None = None
+    scale_m: Annotated[tuple[float, float], "auto or two rising distances [near,far] in metres"] | Literal["auto"] = (
+        "auto"
+    )
     smoothing: Annotated[float, Range(0, 1, below=True)] = 0.0
     frames: Annotated[int, Range(1)] | None = None
     batch_size: Annotated[int, Range(1)] | None = None
 
     def __post_init__(self) -> None:
-        if self.scale_m and not 0 <= self.scale_m[0] < self.scale_m[1]:
+        if self.scale_m != "auto" and not 0 <= self.scale_m[0] < self.scale_m[1]:
             near, far = self.scale_m
             raise ConfigError(f"scale_m: [{near:g},{far:g}] is not rising distances in metres. Pass scale_m=[0,10].")
 
@@ -95,7 +97,7 @@ def predict(config: dict[str, Any]) -> None:
     model = load_model(options)
     log.info("model: %s; %s, fit=%s", model.info, model.backend.name, model.fit)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
-    job = Job(model, output, Style(options.scale_m or (0.0, model.info.farthest_m)), options)
+    job = Job(model, output, Style(None if options.scale_m == "auto" else options.scale_m), options)
     start = time.monotonic()
     try:
         if inputs.images:
@@ -159,6 +161,7 @@ def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]
         job.tally.failed[str(source)] = str(error)
         return
     formats, limit = job.options.formats or default, job.options.frames
+    style = replace(job.style, scale_m=job.style.scale_m or (0.0, job.model.info.max_depth_m))  # the same in all frames
     pictures = [name for name in formats if name in PICTURES and not isinstance(source, int)]
     files = [name for name in formats if name not in pictures]
     with ExitStack() as stack:
@@ -170,9 +173,9 @@ def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]
             job.note_camera(str(source), depth)
             for name, writer in zip(pictures, writers, strict=True):
                 draw = depth.colourise if name == "colour" else depth.side_by_side
-                writer.write(draw(scale_m=job.style.scale_m))
+                writer.write(draw(scale_m=style.scale_m))
             if files:
-                write_depth(stem / f"{frame:06d}", depth, files, job.style)
+                write_depth(stem / f"{frame:06d}", depth, files, style)
 
         # one thread keeps the frames in order
         stream: Stream[int] = Stream(
@@ -211,7 +214,7 @@ def _report(job: Job, *, seconds: float) -> None:
             "input": options.input, "camera": options.camera, "smoothing": options.smoothing,
             "precision": options.precision, "frames": options.frames,
         },
-        "cameras": job.cameras, "scale_m": list(job.style.scale_m), "predicted": tally.done, "failed": tally.failed,
+        "cameras": job.cameras, "scale_m": options.scale_m, "predicted": tally.done, "failed": tally.failed,
     }  # fmt: skip
     try:
         write_json(job.output / "predictions.json", record)

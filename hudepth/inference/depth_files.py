@@ -23,7 +23,7 @@ MAX_JPEG_SIDE = 65_500  # pixels, by libjpeg
 class Style:
     """What all pictures of a run have in common."""
 
-    scale_m: tuple[float, float]  # ends of the colour scale [m]
+    scale_m: tuple[float, float] | None = None  # ends of the colour scale [m]; None: each picture its own
 
 
 FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] = {

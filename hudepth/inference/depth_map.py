@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from hudepth.base.camera import CameraChoice, CameraLike, Intrinsics
 from hudepth.base.errors import DataError
 from hudepth.data.store import MAX_STORED, MM_PER_M, to_mm
-from hudepth.viz.colour import colour_depth
+from hudepth.viz.colour import auto_scale, colour_depth
 from hudepth.viz.point_cloud import PointCloud, point_cloud
 
 FAST_PNG = (
@@ -64,12 +64,13 @@ class DepthMap:
     ) -> UInt8[np.ndarray, "h w2 3"]:
         """Return depth as RGB colours, near red and far blue, with a legend in metres.
 
-        The scale is 0 to ``max_depth_m`` [m] by default; raises ConfigError if its ends are not two rising numbers.
+        The scale [m] is by default that of :func:`hudepth.viz.colour.auto_scale`; raises ConfigError if its ends are
+        not two rising numbers.
         """
-        return colour_depth(self.metres, scale_m=scale_m or (0.0, self.max_depth_m), legend=legend)
+        return colour_depth(self.metres, scale_m=scale_m or auto_scale(self.metres), legend=legend)
 
     def side_by_side(self, *, scale_m: tuple[float, float] | None = None) -> UInt8[np.ndarray, "h w2 3"]:
-        """Return the image with its coloured depth to the right."""
+        """Return the image with its coloured depth to the right; ``scale_m`` as in :meth:`colourise`."""
         return np.hstack([self.image, self.colourise(scale_m=scale_m)])
 
     def point_cloud(self, camera: CameraLike | None = None) -> PointCloud:
