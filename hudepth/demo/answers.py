@@ -14,8 +14,7 @@ from jaxtyping import UInt8
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.images import read_photo, resize_image
 from hudepth.data.store import to_mm
-from hudepth.inference.depth_files import jpeg
-from hudepth.inference.depth_map import DepthMap
+from hudepth.inference.depth_map import DepthMap, jpeg
 from hudepth.inference.model import DepthModel
 from hudepth.viz.colour import colour_depth
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.demo.answers import Answer
-from hudepth.inference.depth_files import FORMATS, Style, jpeg
+from hudepth.inference.depth_files import FORMATS, Style
+from hudepth.inference.depth_map import jpeg
 
 EXAMPLE_ROOMS = (3, 1, 2, 0)  # scenes of the synthetic rooms: a living room, a kitchen, an office, a bedroom
 EXAMPLE_SIZE = (480, 640)

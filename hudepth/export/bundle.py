@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hudepth import __version__
-from hudepth.inference.depth_files import jpeg
-from hudepth.inference.depth_map import DepthMap
+from hudepth.inference.depth_map import DepthMap, jpeg
 from hudepth.inference.model_info import ModelInfo
 from hudepth.runs.bundles import CARD, CONFIG, KIND, ONNX, WEIGHTS
 from hudepth.runs.checkpoint import VERSION, Checkpoint

@@ -45,6 +45,8 @@ class PredictOptions(ModelOptions):
     scale_m: Annotated[tuple[float, float], "auto or two rising distances [near,far] in metres"] | Literal["auto"] = (
         "auto"
     )
+    points: Annotated[int, Range(1)] | None = None
+    edges: bool = False
     smoothing: Annotated[float, Range(0, 1, below=True)] = 0.0
     frames: Annotated[int, Range(1)] | None = None
     batch_size: Annotated[int, Range(1)] | None = None
@@ -53,6 +55,11 @@ class PredictOptions(ModelOptions):
         if self.scale_m != "auto" and not 0 <= self.scale_m[0] < self.scale_m[1]:
             near, far = self.scale_m
             raise ConfigError(f"scale_m: [{near:g},{far:g}] is not rising distances in metres. Pass scale_m=[0,10].")
+
+    @property
+    def style(self) -> Style:
+        """What pictures and point clouds have in common."""
+        return Style(None if self.scale_m == "auto" else self.scale_m, points=self.points, edges=self.edges)
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ def predict(config: dict[str, Any]) -> None:
     model = load_model(options)
     log.info("model: %s; %s, fit=%s", model.info, model.backend.name, model.fit)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
-    job = Job(model, output, Style(None if options.scale_m == "auto" else options.scale_m), options)
+    job = Job(model, output, options.style, options)
     start = time.monotonic()
     try:
         if inputs.images:
@@ -206,7 +213,7 @@ def _report(job: Job, *, seconds: float) -> None:
     log.info("%d predicted in %.1f s (%.1f per second): %s", tally.done, seconds, rate, job.output.resolve())
     record = {
         "model": {"name": info.name, "parameters": info.parameters, "epoch": info.epoch, **info.trained_on},
-        "units": {"png16": "mm", "npy": "m", "ply": "m"},
+        "units": {"png16": "mm", "npy": "m", "ply": "m", "glb": "m"},
         "network_size": list(info.size), "fit": job.model.fit,
         "max_depth_m": info.max_depth_m,
         "calibration": info.calibration and asdict(info.calibration), "backend": job.model.backend.name,

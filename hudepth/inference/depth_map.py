@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from hudepth.base.camera import CameraChoice, CameraLike, Intrinsics
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.files import written_whole
 from hudepth.data.store import MAX_STORED, MM_PER_M, to_mm
 from hudepth.viz.colour import auto_scale, colour_depth
 from hudepth.viz.point_cloud import PointCloud, point_cloud
@@ -22,8 +26,11 @@ FAST_PNG = (
 )  # fmt: skip
 """A fifth larger than with OpenCV's defaults, in half the time, which counts next to a network that takes 50 ms."""
 
+MAX_JPEG_SIDE = 65_500
+"""Pixels, by libjpeg."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class DepthMap:
     """The depth of each pixel of an image."""
 
@@ -33,6 +40,33 @@ class DepthMap:
     notes: tuple[str, ...] = ()  # what reading changed in the image, if it is not obvious
     camera: Intrinsics | None = None  # which took the image, in its pixels, or is assumed; None: NYU's is
     camera_factor: float = 1.0  # by which the network's depth was multiplied for that camera
+
+    def __repr__(self) -> str:
+        height, width = self.metres.shape
+        ends = f"{self.metres.min():.2f} to {self.metres.max():.2f} m" if self.metres.size else "empty"
+        return f"DepthMap({height} x {width}, {ends}, {self.whose_camera})"
+
+    def __eq__(self, other: object) -> bool:
+        """Whether depth, image and everything else are the same."""
+        if not isinstance(other, DepthMap):
+            return NotImplemented
+        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+        return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
+
+    __hash__ = None  # type: ignore[assignment]  # as that of arrays
+
+    def save(self, path: str | Path) -> None:
+        """Write a file whose suffix says what: depth in ``.png`` (16-bit millimetres) or ``.npy`` (metres), points in
+        ``.ply`` or ``.glb``, or a coloured picture in ``.jpg``.
+
+        Raises ConfigError for another suffix, DataError if the file cannot hold this picture, OSError.
+        """
+        path = Path(path).expanduser()
+        if (make := SUFFIXES.get(path.suffix.lower())) is None:
+            raise ConfigError(f"save: '{path.name}' has none of the endings {', '.join(SUFFIXES)}.")
+        data = make(self)  # before anything is written
+        with written_whole(path, durable=False) as part:
+            part.write_bytes(data)
 
     @property
     def whose_camera(self) -> str:
@@ -73,15 +107,42 @@ class DepthMap:
         """Return the image with its coloured depth to the right; ``scale_m`` as in :meth:`colourise`."""
         return np.hstack([self.image, self.colourise(scale_m=scale_m)])
 
-    def point_cloud(self, camera: CameraLike | None = None) -> PointCloud:
+    def point_cloud(self, camera: CameraLike | None = None, *, edges: bool = True) -> PointCloud:
         """Return one coloured point per pixel, by default with the camera that the depth was predicted for.
 
-        Another ``camera``, as :func:`hudepth.load` takes it, moves the points to the sides and leaves depth as it is.
-        Raises ConfigError if it cannot be of this picture, TypeError if it is no camera.
+        ``edges`` false leaves out pixels at depth edges, whose points fly between two surfaces. Another ``camera``, as
+        :func:`hudepth.load` takes it, moves the points to the sides and leaves depth as it is. Raises ConfigError if it
+        cannot be of this picture, TypeError if it is no camera.
         """
         shape = self.metres.shape
         chosen = None if camera is None else CameraChoice.of(camera).of_picture(*shape)
         if chosen is not None:
-            return point_cloud(self.metres, self.image, chosen)
-        cloud = point_cloud(self.metres, self.image, self.camera)
+            return point_cloud(self.metres, self.image, chosen, edges=edges)
+        cloud = point_cloud(self.metres, self.image, self.camera, edges=edges)
         return replace(cloud, comment=cloud.comment + self._factor_words)
+
+    def to_npy(self) -> bytes:
+        """Return a .npy file in metres. NumPy, writing one itself, does not say why it cannot."""
+        memory = io.BytesIO()
+        np.save(memory, self.metres)
+        return memory.getvalue()
+
+
+def jpeg(rgb: UInt8[np.ndarray, "h w 3"], *, quality: int = 92) -> bytes:
+    """Return a picture as a JPEG file; raises DataError if it is too wide or too high for one."""
+    height, width = rgb.shape[:2]
+    if max(height, width) > MAX_JPEG_SIDE:
+        raise DataError(f"a JPEG of {width} x {height} pixels, allowed are {MAX_JPEG_SIDE}. Use formats=[png16,npy].")
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+SUFFIXES: dict[str, Callable[[DepthMap], bytes]] = {
+    ".png": DepthMap.to_png16,
+    ".npy": DepthMap.to_npy,
+    ".ply": lambda depth: depth.point_cloud().to_ply(),
+    ".glb": lambda depth: depth.point_cloud().to_glb(),
+    ".jpg": lambda depth: jpeg(depth.colourise()),
+    ".jpeg": lambda depth: jpeg(depth.colourise()),
+}
+"""What :meth:`DepthMap.save` writes."""
