@@ -35,7 +35,7 @@ FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] =
     "ply": ("_depth.ply", lambda depth, file, style: file.write(style.points_of(depth).to_ply())),
     "glb": ("_depth.glb", lambda depth, file, style: file.write(style.points_of(depth).to_glb())),
 }
-"""By name: the file's ending, and what writes it: ``png16`` in mm; ``npy``, ``ply``, ``glb`` in m; others are pictures."""
+"""By name: the file's ending, and what writes it: png16 in mm; npy, ply and glb in m; the others are pictures."""
 
 
 def write_depth(stem: Path, depth: DepthMap, formats: Sequence[str], style: Style) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, overload
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from PIL import Image
+from torch import nn
 
 from hudepth.base.camera import CameraChoice, CameraLike, CameraOption, Intrinsics
 from hudepth.base.errors import CheckpointError, ConfigError
@@ -55,11 +56,29 @@ class DepthModel:
         """Description of the model and its training."""
         return self.backend.info
 
-    def predict(self, image: Picture, *, camera: CameraLike | None = None) -> DepthMap:
-        """Predict the depth of one image, at its own size; ``camera`` as in :func:`load`, by default the model's.
+    @property
+    def network(self) -> nn.Module:
+        """The network in the form in which it predicts: normalised images [b, 3, h, w] to depth / max_depth_m.
 
-        Raises DataError if the image cannot be read, ConfigError if the camera cannot have taken it.
+        Raises ConfigError for an exported file, which has none.
         """
+        if not isinstance(self.backend, TorchBackend):
+            raise ConfigError(f"checkpoint: {self.info.name} is an exported file. Load the run or bundle it is from.")
+        network: nn.Module = self.backend.pipeline.net
+        return network
+
+    @overload
+    def predict(self, image: list[Any], *, camera: CameraLike | None = None) -> list[DepthMap]: ...
+    @overload
+    def predict(self, image: Picture, *, camera: CameraLike | None = None) -> DepthMap: ...
+    def predict(self, image: Picture | list[Any], *, camera: CameraLike | None = None) -> DepthMap | list[DepthMap]:
+        """Predict the depth of one image, at its own size, or of a list of images, one after the other.
+
+        ``camera`` is as in :func:`load`, by default the model's. Raises DataError if an image cannot be read,
+        ConfigError if the camera cannot have taken it.
+        """
+        if isinstance(image, list):
+            return [self.predict(each, camera=camera) for each in image]
         prepared = self.prepare(image, camera=camera)
         return self.finish(prepared, self.run([prepared])[0])
 

@@ -10,6 +10,7 @@ from PIL import Image
 
 import hudepth
 from hudepth.base.errors import CheckpointError, ConfigError, DataError
+from hudepth.base.normalise import NormaliseBytes
 from hudepth.inference.backends import TorchBackend
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
@@ -148,3 +149,14 @@ def test_half_precision_needs_a_gpu(tiny: Path, precision: str, fix: str) -> Non
         hudepth.load(tiny, device="cpu", precision=precision)
     with pytest.raises(ConfigError, match=r"^precision: 'half' is not"):
         hudepth.load(tiny, device="cpu", precision="half")
+
+
+def test_the_network_is_a_torch_module_and_a_list_gives_a_list(tiny: Path) -> None:
+    model = hudepth.load(tiny, threads=1)
+    image = np.random.default_rng(0).integers(256, size=(*model.info.size, 3), dtype=np.uint8)
+    normalised = NormaliseBytes()(torch.from_numpy(image)[None])
+    with torch.inference_mode():
+        unit_depth = model.network(normalised)
+    one, two = model.predict([image, image[::-1]])
+    np.testing.assert_allclose(unit_depth[0, 0] * model.info.max_depth_m, one.metres, atol=1e-5)
+    assert one == model.predict(image) != two

@@ -1,5 +1,10 @@
 from __future__ import annotations
 
+import json
+import struct
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +12,7 @@ from hypothesis import strategies as st
 
 from hudepth.base.camera import Intrinsics
 from hudepth.base.errors import ConfigError
-from hudepth.viz.point_cloud import point_cloud
+from hudepth.viz.point_cloud import PointCloud, depth_edges, point_cloud
 
 
 def read_ply(data: bytes) -> tuple[list[str], np.ndarray]:
@@ -69,3 +74,86 @@ def test_nyu_stands_in_for_a_camera_that_nobody_stated_and_the_file_says_so() ->
 def test_no_camera(values: tuple[float, ...]) -> None:
     with pytest.raises(ConfigError, match=r"^camera: .* Pass camera="):
         Intrinsics(*values)
+
+
+def read_glb(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """A reader of its own, after the glTF 2.0 specification: the document, then the attributes of its points."""
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    assert size % 4 == 0
+    document = json.loads(data[20 : 20 + size])
+    binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
+    binary = data[28 + size :]
+    assert kind == b"BIN\0"
+    assert binary_size == len(binary) == document["buffers"][0]["byteLength"]
+    assert binary_size % 4 == 0
+    (primitive,) = document["meshes"][document["nodes"][document["scenes"][0]["nodes"][0]]["mesh"]]["primitives"]
+    assert primitive["mode"] == 0
+    found = {}
+    for name, number in primitive["attributes"].items():
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor["bufferView"]]
+        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        found[name] = np.frombuffer(part, dtype).reshape(accessor["count"], int(accessor["type"][3:]))
+    ends = document["accessors"][primitive["attributes"]["POSITION"]]
+    if len(found["POSITION"]):
+        np.testing.assert_array_equal(found["POSITION"].min(axis=0), np.float32(ends["min"]))
+        np.testing.assert_array_equal(found["POSITION"].max(axis=0), np.float32(ends["max"]))
+    return document, found
+
+
+@given(st.integers(0, 50), st.booleans(), st.integers(0, 99))
+def test_a_glb_file_holds_the_points_with_y_up(count: int, coloured: bool, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(count, 3)).astype(np.float32)
+    colours = random.integers(256, size=(count, 3), dtype=np.uint8) if coloured else None
+    document, found = read_glb(PointCloud(points, colours, "camera: x").to_glb())
+    assert document["asset"]["version"] == "2.0"
+    np.testing.assert_array_equal(found["POSITION"], points * [1, -1, -1])
+    np.testing.assert_array_equal(found["COLOR_0"][:, :3], np.full((count, 3), 255) if colours is None else colours)
+    assert (found["COLOR_0"][:, 3] == 255).all()
+
+
+@given(st.integers(0, 300), st.integers(1, 300))
+def test_thinning_keeps_that_many_of_the_points(count: int, points: int) -> None:
+    numbers = np.arange(3 * count, dtype=np.float32).reshape(count, 3)
+    cloud = PointCloud(numbers, np.tile((np.arange(count) % 256).astype(np.uint8)[:, None], (1, 3)))
+    thin = cloud.thin(points)
+    assert len(thin.points_m) == min(count, points)
+    assert thin.colours is not None
+    rows = (thin.points_m[:, 0] / 3).astype(int)
+    assert len(set(rows)) == len(rows)
+    assert (thin.colours[:, 0] == rows % 256).all()
+    np.testing.assert_array_equal(thin.points_m, cloud.thin(points).points_m)
+
+
+def test_points_between_two_surfaces_are_edges_and_those_on_a_surface_are_not() -> None:
+    """A wall 2 m away before one at 4 m, joined by a ramp of five pixels as a network draws it."""
+    camera = Intrinsics(520.0, 520.0, 319.5, 239.5)
+    depth = np.full((480, 640), 4.0, np.float32)
+    depth[:, 200:400] = 2.0
+    ramp = cv2.blur(depth, (5, 1))
+    edges = depth_edges(ramp, camera)
+    between = (ramp > 2.01) & (ramp < 3.99)
+    assert edges[between].all()
+    near_edge = cv2.dilate(between.astype(np.uint8), np.ones((3, 3))) > 0
+    assert not edges[~near_edge].any()
+    flying = point_cloud(ramp, None, camera).points_m
+    assert ((flying[:, 2] > 2.01) & (flying[:, 2] < 3.99)).sum() == between.sum() > 0
+    kept = point_cloud(ramp, None, camera, edges=False).points_m
+    assert not ((kept[:, 2] > 2.01) & (kept[:, 2] < 3.99)).any()
+
+
+@pytest.mark.parametrize("scale", [0.25, 1.0, 3.0])
+def test_a_floor_and_a_slanted_wall_are_no_edges_at_any_resolution(scale: float) -> None:
+    height, width, focal = round(480 * scale), round(640 * scale), 520 * scale
+    camera = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
+    rows = (np.arange(height) - camera.cy)[:, None] / focal
+    floor = np.broadcast_to(np.where(rows > 1.5 / 12, 1.5 / np.maximum(rows, 1e-6), 12.0), (height, width))
+    assert not depth_edges(floor.astype(np.float32), camera)[rows[:, 0] > 1.6 / 12].any()
+    across = (np.arange(width) - camera.cx)[None] / focal
+    wall = np.broadcast_to(3 / (1 - 0.9 * across), (height, width)).astype(np.float32)
+    assert not depth_edges(wall, camera).any()
