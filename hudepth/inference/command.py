@@ -168,7 +168,7 @@ def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]
         job.tally.failed[str(source)] = str(error)
         return
     formats, limit = job.options.formats or default, job.options.frames
-    style = replace(job.style, scale_m=job.style.scale_m or (0.0, job.model.info.max_depth_m))  # the same in all frames
+    style = replace(job.style, scale_m=job.style.scale_m or (0.0, job.model.info.farthest_m))  # the same in all frames
     pictures = [name for name in formats if name in PICTURES and not isinstance(source, int)]
     files = [name for name in formats if name not in pictures]
     with ExitStack() as stack:
