@@ -22,8 +22,8 @@ ADDED_GROUPS = ("experiment", "sweep")
 PATHS = {
     "input", "output", "checkpoint", "resume", "init", "run", "runs", "dir", "a", "b", "name", "images", "sweep_dir",
     "model.weights", "distill.teacher", "data.root", "data.cache", "data.teacher", "data.source.images",
-    "data.source.depths", "data.source.manifest", "paths.runs", "paths.sweeps", "paths.cache", "camera",
-    "predictions", "data.source.camera",
+    "data.source.depths", "data.source.manifest", "data.source.train_list", "data.source.test_list",
+    "paths.runs", "paths.sweeps", "paths.cache", "camera", "predictions", "data.source.camera",
 }  # fmt: skip
 """Options that are paths, names or a camera (``fov=62``): text, whatever Hydra's grammar would make of it."""
 

@@ -192,7 +192,8 @@ def _check_units(source: Source, records: Sequence[Record]) -> None:
     own_scale = source.depth_scale_m is not None or any(record.depth_scale_m is not None for record in records)
     shown = [] if own_scale else raws
     name, encoding = source.name, source.encoding
-    found = check_range(depths, indoor=source.indoor, encoding=encoding, name=name, raws=shown)
+    usual = source.usual_median_m
+    found = check_range(depths, indoor=source.indoor, encoding=encoding, name=name, usual_m=usual, raws=shown)
     if source.indoor and found.median_m > FAR_INDOORS_M and encoding != "paper_literal":
         fix = suggest(shown) or "data.source.indoor=false if it is not indoors"
         log.warning("%s: a median depth of %.3g m is far for rooms. Meant is perhaps %s", name, found.median_m, fix)

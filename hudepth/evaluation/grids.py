@@ -99,7 +99,7 @@ class Scored:
         """Return the key of the aligned and clamped prediction; protocols with equal keys share it."""
         limits = protocol.caps[1:]
         if protocol.alignment != "none":
-            seen = (tuple(key or ()) for key in (protocol.crop, protocol.crop_size))
+            seen = (tuple(key or ()) for key in (protocol.crop, protocol.crop_size, protocol.crop_shares))
             return (protocol.alignment, *seen, protocol.caps), limits if protocol.clamp else None
         if not protocol.clamp:
             return None, None

@@ -25,6 +25,7 @@ from hudepth.metrics.summary import SummaryOptions
 
 _Positive = Annotated[float, Range(0, above=True)]
 _Crop = Annotated[Sequence[int], Range(0), "[top,bottom,left,right]"]
+_Shares = Annotated[Sequence[float], Range(0, 1), "[top,bottom,left,right] as shares of 1"]
 _Size = Annotated[Sequence[int], Range(1), "[height,width]"]
 
 
@@ -47,6 +48,8 @@ class Protocol:
     crop_size: _Size | None = (480, 640)
     """(height, width) the crop refers to; for images of another size it is scaled. None: it counts pixels of each image
     as it is, and smaller images are left out."""
+    crop_shares: _Shares | None = None
+    """Instead of ``crop``: top, bottom, left and right as shares of height and width, in pixels rounded down."""
     valid: Annotated[str, Choice(("open", "closed", "measured"))] = "open"
     """Which measured pixels count: ``open``: min_depth_m < depth < max_depth_m; ``closed``: the same with both ends;
     ``measured``: all of them, at any depth."""
@@ -80,6 +83,9 @@ class Protocol:
         if self.crop is not None and not _is_crop(self.crop, self.crop_size):
             within = f" within {list(self.crop_size)}" if self.crop_size else ""
             raise ConfigError(f"{key}.crop: {list(self.crop)} is not [top,bottom,left,right]{within}.")
+        if self.crop_shares is not None and (self.crop is not None or not _is_crop(self.crop_shares, (1, 1))):
+            wanted = "[top,bottom,left,right] between 0 and 1, with crop=null"
+            raise ConfigError(f"{key}.crop_shares: {list(self.crop_shares)} is not {wanted}.")
         if self.max_depth_m is not None and self.max_depth_m <= self.min_depth_m:
             raise ConfigError(f"{key}.max_depth_m: {self.max_depth_m} is not above min_depth_m.")
         try:
@@ -112,6 +118,9 @@ class Protocol:
 
     def window(self, height: int, width: int) -> tuple[slice, slice] | None:
         """Return the rows and columns that count in an image of this size; None if the crop exceeds it or none do."""
+        if self.crop_shares is not None:
+            rows, columns = (slice(int(a * n), int(b * n)) for a, b, n in _sides(self.crop_shares, height, width))
+            return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
         if self.crop is None:
             return slice(0, height), slice(0, width)
         top, bottom, left, right = self.crop
@@ -130,6 +139,7 @@ class Protocol:
             "resize": f"{self.resize}, align_corners=False" if self.needs_native else "none",
             "crop": list(self.crop) if self.crop else None,
             "crop_size": list(self.crop_size) if self.crop and self.crop_size else None,
+            **({"crop_shares": list(self.crop_shares)} if self.crop_shares else {}),
             "valid": self._valid_rule(),
             "clamp_m": [self.min_depth_m, self.max_depth_m] if self.clamp else None,
             "averaging": self.averaging,
@@ -153,6 +163,11 @@ class Protocol:
         return f"measured, {self.min_depth_m:.15g} m {less} truth{upper}"
 
 
-def _is_crop(crop: Sequence[int], size: Sequence[int] | None) -> bool:
+def _sides(shares: Sequence[float], height: int, width: int) -> list[tuple[float, float, int]]:
+    top, bottom, left, right = shares
+    return [(top, bottom, height), (left, right, width)]
+
+
+def _is_crop(crop: Sequence[float], size: Sequence[float] | None) -> bool:
     ordered = len(crop) == 4 and crop[0] < crop[1] and crop[2] < crop[3]
     return ordered and (size is None or (crop[1] <= size[0] and crop[3] <= size[1]))

@@ -10,8 +10,9 @@ Sources: Zhou et al. 2017 (median scaling); Godard et al. 2019 (Monodepth2), who
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hudepth.base.masked import widen, widest_float
@@ -29,14 +30,25 @@ def scale_errors(pred_m: DepthMap, target_m: DepthMap, valid: Mask) -> Float[Ten
     device = pred_m.device
     rows = torch.full((len(pred_m), 2), torch.nan, dtype=widest_float(device), device=device)
     for row, pred, target, mask in zip(rows, pred_m, target_m, valid, strict=True):
-        p, t = pred[mask], target[mask]
+        p, t = _picked(pred, mask), _picked(target, mask)
         if len(p) and (middle := median(p)) > 0:
             scale = median(t) / middle
             row[0], row[1] = scale.log(), widen((scale * p - t).abs().div_(t).mean())
     return rows
 
 
+def _picked(x: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) -> Float[Tensor, " n"]:
+    if x.device.type == "cpu":  # in a tenth of torch's time
+        return torch.from_numpy(x.numpy()[mask.numpy()])
+    return x[mask]
+
+
 def median(x: Float[Tensor, " n"]) -> Float[Tensor, ""]:
-    """Return the median of n > 0 values as numpy does, the mean of the two middle ones."""
-    # torch.median takes the lower one; kthvalue may differ on GPUs
-    return (x.median() - (-x).median()) / 2
+    """Return the median of n > 0 values as numpy does, the mean of the two middle ones; NaN if one is NaN."""
+    if x.device.type != "cpu":  # torch.median takes the lower one; kthvalue may differ on GPUs
+        return (x.median() - (-x).median()) / 2
+    half = len(x) // 2
+    values = np.partition(x.numpy(), half)  # a tenth of torch.median's time
+    upper = values[half]
+    lower = upper if len(x) % 2 else values[:half].max()
+    return x.new_tensor(np.nan if np.isnan(values[half:].max()) else (lower + upper) / 2)

@@ -122,7 +122,7 @@ def test_other_data(command: Command, run: Path) -> None:
     [
         (["data.rooot=x"], "data.rooot: the checkpoint's data has no such key."),
         (["data.source.scenes=7"], "the split of rooms is not the one it was trained with"),
-        (["protocol=eigne"], "protocol: no 'eigne'. Did you mean 'eigen'? Pass one of densedepth, eigen, eigen_flip"),
+        (["protocol=eigne"], "protocol: no 'eigne'. Did you mean 'eigen'? Pass one of densedepth, diode_indoors, "),
     ],
 )  # fmt: skip
 def test_mistakes(arguments: list[str], message: str, command: Command, trained: Path, tmp_path: Path) -> None:

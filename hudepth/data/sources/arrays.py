@@ -14,8 +14,11 @@ from hudepth.base.images import check_file, check_pixels
 _PFM = re.compile(rb"Pf\s(\d{1,6})\s+(\d{1,6})\s+([-+.\deE]{1,20})[ \t\r]*\n")
 
 
-def read_npy(path: Path, where: str) -> NDArray[np.generic]:
-    """Read an array of [H, W], [1, H, W] or [H, W, 1] numbers; DataError if it is none, or too large."""
+def read_npy(path: Path, where: str, *, kinds: str = "uif") -> NDArray[np.generic]:
+    """Read an array of [H, W], [1, H, W] or [H, W, 1] numbers of some of numpy's ``kinds``.
+
+    Raises DataError if it is none, or too large.
+    """
     check_file(path)
     try:  # open_memmap reads the header alone, refuses pickles, and finds files that are cut short
         mapped = np.lib.format.open_memmap(path, mode="r")
@@ -26,7 +29,7 @@ def read_npy(path: Path, where: str) -> NDArray[np.generic]:
     shape = mapped.shape
     if mapped.ndim == 3 and 1 in (shape[0], shape[2]):
         shape = shape[1:] if shape[0] == 1 else shape[:2]
-    if len(shape) != 2 or mapped.dtype.kind not in "uif":
+    if len(shape) != 2 or mapped.dtype.kind not in kinds:
         what = "a mask" if mapped.dtype.kind == "b" else f"{mapped.dtype} array of shape {mapped.shape}"
         raise DataError(f"{where}: {what}. Save one number per pixel, as [H, W].")
     check_pixels(*shape, where=where)

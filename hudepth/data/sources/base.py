@@ -70,6 +70,8 @@ class Source(ABC):
     """How depth values become metres; one of :data:`hudepth.data.encoding.ENCODINGS`."""
     indoor: bool = True
     """Whether depths must be plausible for rooms."""
+    usual_median_m: tuple[float, float] | None = None
+    """Median depths [m] the set can have, which a wrong unit leaves; None: those of rooms, if it is indoors."""
     farthest_m: float | None = None
     """Largest depth [m] the store must hold; None: 65.535 m indoors, else 255.996 m. Steps are as fine as it allows."""
     sparse: bool = False

@@ -32,14 +32,14 @@ class DepthRange(NamedTuple):
 
 def check_range(
     depths: Sequence[NDArray[np.float32]], *, indoor: bool, encoding: str, name: str,
-    raws: Sequence[NDArray[np.generic]] = (),
+    usual_m: tuple[float, float] | None = None, raws: Sequence[NDArray[np.generic]] = (),
 ) -> DepthRange:  # fmt: skip
     """Measure the range of a sample of depths [H, W] in metres, 0 where unmeasured.
 
     Raises DataError if nothing is measured, if an indoor set's median is outside :data:`INDOOR_MEDIAN_M`, except under
     ``paper_literal``, which is implausible on purpose, or if ``auto`` would take values for millimetres that need not
     be any. ``name`` is the set's, for errors; they name encodings that would make ``raws``, the same depths as
-    stored, plausible for a room.
+    stored, plausible for a room. ``usual_m``: medians [m] a known set can have; others are refused.
     """
     others = ", ".join(other for other in ENCODINGS if other not in (encoding, "auto"))
     measured = np.concatenate([depth[depth > 0] for depth in depths] or [np.zeros(0, np.float32)])
@@ -52,6 +52,11 @@ def check_range(
     found = DepthRange(float(measured.min()), float(np.median(measured)), float(measured.max()), share)
     if encoding == "auto":
         _check_guess(found, raws, indoor=indoor, name=name)
+    if usual_m and encoding != "paper_literal" and not usual_m[0] <= found.median_m <= usual_m[1]:
+        raise DataError(
+            f"data.encoding={encoding}: '{name}' has a median depth of {found.median_m:.3g} m, the set's own lie in "
+            f"{usual_m[0]:g} to {usual_m[1]:g} m. Leave data.encoding out, or copy the files again."
+        )
     low, high = INDOOR_MEDIAN_M
     if indoor and encoding != "paper_literal" and not low <= found.median_m <= high:
         raise DataError(
