@@ -22,19 +22,20 @@ from hudepth.base.wording import more_room
 from hudepth.export.bundle import halve, write_bundle, zip_folder
 from hudepth.export.card import model_card
 from hudepth.export.comparison_images import ComparisonImages, find_images
-from hudepth.export.graphs import export_onnx, export_openvino, export_program
+from hudepth.export.graphs import INPUT, export_onnx, export_openvino, export_program
 from hudepth.export.int8_accuracy import measure_int8
 from hudepth.export.parity import Parity, check, compare
 from hudepth.export.quantise import check_calibration, quantise
-from hudepth.inference.backends import PT2, TorchBackend, open_exported
+from hudepth.inference.backends import PT2, GraphBackend, TorchBackend, open_exported
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
+from hudepth.inference.runtimes import onnx_session
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 from hudepth.runs.results import read_metrics
 
 OWN = [PT2, "onnx", "xml"]  # files made here are read without suspicion
-FORMATS = ("onnx", "torch_export", "openvino", "int8", "bundle")
+FORMATS = ("onnx", "onnx_any_size", "torch_export", "openvino", "int8", "bundle")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,6 +137,17 @@ def _onnx(work: Work) -> dict[str, Any]:
     return work.keep(path, parity=work.compare(path, backend="onnxruntime"))
 
 
+def _onnx_any_size(work: Work) -> dict[str, Any]:
+    """Compare at the network's size, where resizing changes nothing; elsewhere rounding to bytes decides."""
+    path, info = work.folder / "model_any_size.onnx", replace(work.info, processing=True)
+    export_onnx(work.net, path, info=info, any_size=True)
+    session = onnx_session(path, threads=usable_cores())
+    opened = GraphBackend("onnxruntime", info, lambda rgb: session.run(None, {INPUT: rgb})[0])
+    parity = compare(opened, work.reference, work.images.compared)
+    check(parity, what=path.name, tolerance_mm=work.options.tolerance_mm)
+    return work.keep(path, parity=parity)
+
+
 def _torch_export(work: Work) -> dict[str, Any]:
     path = work.folder / "model.pt2"
     export_program(work.net, path, info=work.info)
@@ -195,7 +207,8 @@ def _bundle(work: Work) -> dict[str, Any]:
 
 
 MAKERS: dict[str, Callable[[Work], dict[str, Any]]] = {
-    "onnx": _onnx, "torch_export": _torch_export, "openvino": _openvino, "int8": _int8, "bundle": _bundle,
+    "onnx": _onnx, "onnx_any_size": _onnx_any_size, "torch_export": _torch_export, "openvino": _openvino,
+    "int8": _int8, "bundle": _bundle,
 }  # fmt: skip
 
 

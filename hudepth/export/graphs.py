@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from hudepth import __version__
 from hudepth.base.files import written_whole
+from hudepth.export.any_size import AnySize
 from hudepth.inference.backends import DepthPipeline
 from hudepth.inference.image_fit import FOCAL_POWERS
 from hudepth.inference.model_info import ModelInfo
@@ -59,6 +60,16 @@ def describe(info: ModelInfo) -> dict[str, str]:
     }
 
 
+def describe_any_size(info: ModelInfo) -> dict[str, str]:
+    """Return the metadata of a file that resizes by itself: for people and other programs only."""
+    stated = describe(info)
+    for key in (KEY, "resize"):
+        del stated[key]
+    stated["input"] = f"{INPUT}: uint8 [batch, height, width, 3], RGB, of any size"
+    stated["output"] = f"{OUTPUTS[True]}: float32 [batch, height, width], distance along the optical axis in metres"
+    return stated
+
+
 def _describe_camera(info: ModelInfo) -> dict[str, str]:
     """Return what a picture of another camera than that of the training needs; nothing if that is not known."""
     if info.training_focal is None:
@@ -68,20 +79,25 @@ def _describe_camera(info: ModelInfo) -> dict[str, str]:
     return {"camera": f"for pictures of focal lengths fx, fy [pixels], multiply depth by {ratios}"}
 
 
-def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo) -> None:
-    """Write a network (normalised image to unit depth) as ONNX; raises ConfigError if onnx or onnxscript is missing."""
+def export_onnx(net: nn.Module, path: Path, *, info: ModelInfo, any_size: bool = False) -> None:
+    """Write a network (normalised image to unit depth) as ONNX; raises ConfigError if onnx or onnxscript is missing.
+
+    ``any_size``: with resizing as part of the graph, which must include processing. hudepth does not read such a file.
+    """
     for name in ("onnx", "onnxscript"):
         package(name, extra="onnx")
     graph, image = export_graph(net, info)
+    sides = ("batch", "height", "width") if any_size else ("batch",)
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
-            graph, (image,), dynamo=True, opset_version=OPSET, verbose=False,
-            dynamic_shapes=({0: torch.export.Dim("batch", min=1)},),
-            input_names=[INPUT], output_names=[OUTPUTS[info.processing]],
+            AnySize(graph, info.size).eval() if any_size else graph, (image,), dynamo=True, opset_version=OPSET,
+            dynamic_shapes=({axis: torch.export.Dim(side, min=1) for axis, side in enumerate(sides)},),
+            input_names=[INPUT], output_names=[OUTPUTS[info.processing]], verbose=False,
         )  # fmt: skip
     assert program is not None
     model = program.model_proto
-    for key, value in describe(info).items():
+    described = describe_any_size(info) if any_size else describe(info)
+    for key, value in described.items():
         model.metadata_props.add(key=key, value=value)
     model.producer_name = "hudepth"
     with written_whole(path) as part:

@@ -74,7 +74,7 @@ def exported(trained: Path, tmp_path_factory: pytest.TempPathFactory, cache: Pat
     folder = tmp_path_factory.mktemp("exported")
     run = folder / "runs" / "tiny" / trained.name  # int8 is tested, which the run notes
     shutil.copytree(trained, run)
-    formats = "format=[onnx,torch_export,openvino,int8,bundle]"
+    formats = "format=[onnx,onnx_any_size,torch_export,openvino,int8,bundle]"
     arguments = (f"checkpoint={run}", formats, "compared=4", "calibration=8", "output=out")
     done = subprocess.run(**script("export", *arguments, cwd=folder, cache=cache), check=False)
     assert done.returncode == 0, done.stdout
@@ -86,13 +86,13 @@ def exported(trained: Path, tmp_path_factory: pytest.TempPathFactory, cache: Pat
 def test_every_format_is_compared_on_real_images_before_it_is_kept(exported: Path) -> None:
     record = json.loads((exported / "export.json").read_text())
     assert record["images"] == "test images of rooms"
-    for name in ("onnx", "torch_export", "openvino", "bundle"):
+    for name in ("onnx", "onnx_any_size", "torch_export", "openvino", "bundle"):
         assert record[name]["compared"]["images"] == 2  # all test images there are
         assert record[name]["compared"]["worst_mm"] < 0.1
     assert record["int8"]["calibrated_on"] == 8
     assert {file.name for file in exported.iterdir()} == {
-        "model.onnx", "model.pt2", "model.xml", "model.bin", "model_int8.xml", "model_int8.bin", "tiny", "export.json",
-        "log.txt",
+        "model.onnx", "model_any_size.onnx", "model.pt2", "model.xml", "model.bin", "model_int8.xml", "model_int8.bin",
+        "tiny", "export.json", "log.txt",
     }  # fmt: skip
     log = (exported / "log.txt").read_text()
     assert "model.onnx: at most" in log
@@ -147,6 +147,25 @@ def test_onnx_states_names_units_and_origin(exported: Path) -> None:
     assert stated["input"] == "image: uint8 [batch, 32, 48, 3], RGB, the whole image resized to this size"
     assert stated["output"].endswith("distance along the optical axis in metres")
     assert json.loads(stated["trained_on"])["source"] == "rooms"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(32, 48), (61, 97), (130, 90), (40, 31)])
+def test_a_graph_for_any_size_predicts_what_hudepth_does(size: tuple[int, int], exported: Path, trained: Path) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(str(exported / "model_any_size.onnx"))
+    photos = np.random.default_rng(0).integers(256, size=(2, *size, 3), dtype=np.uint8)
+    (depth,) = session.run(None, {"image": photos})
+    model = hudepth.load(trained)
+    assert depth.shape == photos.shape[:3]
+    for found, photo in zip(depth, photos, strict=True):  # rounding to bytes can fall either way
+        expected = model.predict(photo).metres
+        assert np.abs(found - expected).mean() < 2e-3
+        assert np.abs(found - expected).max() < 2e-2
+    stated = session.get_modelmeta().custom_metadata_map
+    assert stated["input"] == "image: uint8 [batch, height, width, 3], RGB, of any size"
+    with pytest.raises(CheckpointError, match=r"was not exported by hudepth"):
+        hudepth.load(exported / "model_any_size.onnx")
 
 
 @pytest.fixture(scope="session")
