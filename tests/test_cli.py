@@ -46,7 +46,7 @@ def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
         ("test", [], "checkpoint is not set. Pass checkpoint=<file | run directory | last>, or predictions=<folder"),
         ("test", ["checkpoint=nowhere.ckpt"], "checkpoint: no file or run directory 'nowhere.ckpt'. Pass a "),
         ("test", ["checkpoint=last"], "checkpoint=last: no run with a checkpoint below 'runs'. Train one with"),
-        ("data", [], "a verb is missing. Type hudepth-data followed by prepare or info or audit or calibrate."),
+        ("data", [], "a verb is missing. Type hudepth-data followed by prepare or info or audit or download or "),
         ("data", ["inf"], "no verb 'inf'. Did you mean 'info'? Type hudepth-data followed by prepare or "),
         ("data", ["prepare", "data=nyu_labeled"], "data.root is not set. Pass data.root=<"),
     ],

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-SUBCOMMANDS = {"data": ("prepare", "info", "audit", "calibrate"), "report": ("compare", "table", "sweep", "figures")}
+SUBCOMMANDS = {
+    "data": ("prepare", "info", "audit", "download", "calibrate"),
+    "report": ("compare", "table", "sweep", "figures"),
+}
 """The first word after the console scripts that can do several things."""
 OWN_COMMAND = {("data", "calibrate")}
 """Verbs that need more than their script's command may import: they run the function of their own name."""

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import parse
 from hudepth.base.tables import Table
 from hudepth.data.audit.run_audit import audit
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.download.fetch import fetch
 from hudepth.data.prepare import store_path
-from hudepth.data.sources.base import Record
+from hudepth.data.sources.base import Record, Source
 from hudepth.data.splits import SUBSETS, make_split
 
 
@@ -22,21 +24,36 @@ from hudepth.data.splits import SUBSETS, make_split
 class DataOptions:
     """Options of hudepth-data, as in ``conf/data.yaml``."""
 
-    verb: Literal["prepare", "info", "audit"]
+    verb: Literal["prepare", "info", "audit", "download"]
     data: Mapping[str, Any]
     trust: list[str]
 
 
 def data(config: dict[str, Any]) -> None:
-    """Run the verb ``prepare``, ``info`` or ``audit``; HudepthError has one line for the user."""
+    """Run the verb ``prepare``, ``info``, ``audit`` or ``download``; HudepthError has one line for the user."""
     options = parse(DataOptions, config)
     datamodule = build_data(options.data, trust=options.trust)
-    if options.verb == "audit":
+    if options.verb == "download":
+        _download(datamodule.source)
+    elif options.verb == "audit":
         audit(config, datamodule)
     elif options.verb == "info":
         _describe(datamodule).show(show_header=False)
     else:
         print(f"{len(datamodule.store)} pairs in {datamodule.store.path}")
+
+
+def _download(source: Source) -> None:
+    """Fetch the file of a set into ``data.root``, a folder or the path of the file."""
+    what, root = source.download, getattr(source, "root", None)
+    if what is None:
+        where = f"See {source.homepage}" if source.homepage else "It needs none"
+        raise ConfigError(f"data: there is no download of {source.name}. {where}; docs/data.md says what goes where.")
+    if not root:
+        raise ConfigError(f"data.root is not set. Pass data.root=<folder for {what.file}, {what.size / 1e9:.2f} GB>.")
+    path = Path(root).expanduser()
+    path = fetch(what, path if path.name == what.file else path / what.file)
+    print(f"{path}: complete. {source.terms}".rstrip())
 
 
 def _describe(datamodule: DepthDataModule) -> Table:

@@ -41,6 +41,18 @@ class Record:
 
 
 @dataclass(frozen=True, slots=True)
+class Download:
+    """A file that anybody may download, as its authors published it."""
+
+    url: str
+    file: str
+    """Its name in ``data.root``."""
+    size: int
+    """Bytes."""
+    md5: str
+
+
+@dataclass(frozen=True, slots=True)
 class RawPair:
     """One pair, decoded: image [H, W, 3] RGB, and depth [H, W] of any dtype, still in the source's own encoding."""
 
@@ -64,6 +76,8 @@ class Source(ABC):
     homepage: ClassVar[str] = ""
     licence: ClassVar[str] = "other"
     """Licence identifier of the data for model cards, for example ``mit``."""
+    download: ClassVar[Download | None] = None
+    """What ``hudepth-data download`` fetches; None: sets that ask for an account, or have several parts."""
     terms: ClassVar[str] = ""
     """What the data is and what its owners permit, in a sentence for model cards."""
     encoding: str

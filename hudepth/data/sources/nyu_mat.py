@@ -15,7 +15,7 @@ from hudepth.base.images import check_pixels
 from hudepth.base.options import Choice
 from hudepth.data.encoding import Encoding
 from hudepth.data.sources import nyu
-from hudepth.data.sources.base import EncodedSource, RawPair, Record, existing_root
+from hudepth.data.sources.base import Download, EncodedSource, RawPair, Record, existing_root
 from hudepth.data.sources.files import PerProcess, make_pair
 from hudepth.data.sources.hdf5 import own_array
 
@@ -35,6 +35,12 @@ class NyuMatSource(nyu.Nyu, EncodedSource):
     """
 
     name: ClassVar[str] = "nyu_mat"
+    download: ClassVar[Download | None] = Download(
+        url=f"http://horatio.cs.nyu.edu/mit/silberman/nyu_depth_v2/{_FILE}",
+        file=_FILE,
+        size=2_972_037_809,
+        md5="520609c519fba3ba5ac58c8fefcc3530",
+    )
 
     root: str | Path | None
     _: KW_ONLY

@@ -1,0 +1,1 @@
+"""Fetching a data set that anybody may download."""
