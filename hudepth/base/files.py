@@ -20,7 +20,7 @@ from hudepth.base.errors import ConfigError
 
 MAX_TEXT_BYTES = 1 << 28
 """Of a file of text: no run writes a larger one."""
-_LEFTOVER = re.compile(r"\.(?:.*\.(\d+)\.part(?:\.mp4)?|export-(\d+)-.*)")  # of the process with this id
+_LEFTOVER = re.compile(r"\.(?:.*\.(\d+)\.part(?:\.mp4|\.webm)?|export-(\d+)-.*)")  # of the process with this id
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from hudepth.inference.stream import Stream, Tally
 from hudepth.inference.video import FrameReader, VideoWriter
 
 IMAGE_FORMATS, VIDEO_FORMATS, CAMERA_FORMATS = ["png16", "npy", "colour"], ["colour"], ["png16", "colour"]  # defaults
-PICTURES = {"colour": "_depth.mp4", "side": "_side.mp4"}  # formats that make a video of a video, and its ending
+PICTURES = {"colour": "_depth", "side": "_side"}  # formats that make a video of a video, and what its name adds
 
 MOST_WORKERS = 16  # threads that decode and write beside a GPU
 
@@ -195,6 +195,9 @@ def _predict_frames(job: Job, source: Path | int, stem: Path, default: list[str]
                 pass
         except KeyboardInterrupt:
             log.info("%s: stopped by Ctrl-C; finished predictions are kept", reader.name)
+    for each in writers:
+        if each.codec is not None:
+            log.info("%s: %s", each.path.name, each.codec.words)
     if limit is None and (line := reader.shortfall()):
         job.tally.failed[str(source)] = f"{reader.name}: {line}."
 

@@ -17,7 +17,7 @@ VIDEO_SUFFIXES = (
 )  # fmt: skip
 UNREAD_SUFFIXES = (".heic", ".heif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 """Photographs that are not decoded here: they are tried, so that each is listed with the reason."""
-_RESULT = re.compile(r".+_(depth|side)\.(png|jpg|mp4)")  # as inference/depth_files.py names pictures
+_RESULT = re.compile(r".+_(depth|side)\.(png|jpg|mp4|webm)")  # as inference/depth_files.py names pictures
 
 
 class Item(NamedTuple):

@@ -174,7 +174,7 @@ def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) 
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         ended.wait()
     (tmp_path / "eigen").mkdir()
-    names = (f".a.json.{ended.pid}.part", f"eigen/.b.png.{ended.pid}.part", f".c.{ended.pid}.part.mp4")
+    names = (f".a.json.{ended.pid}.part", f"eigen/.b.png.{ended.pid}.part", f".c.{ended.pid}.part.webm")
     dead = [tmp_path / name for name in names]
     kept = [tmp_path / f".a.json.{os.getpid()}.part", tmp_path / ".hidden", tmp_path / "x.part"]
     for path in (*dead, *kept):

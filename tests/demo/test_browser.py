@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -18,16 +17,12 @@ import pytest
 
 from hudepth.data.store import to_mm
 from hudepth.inference.model import DepthModel
+from tests.browser import chromium
 
 from .conftest import HOSTILE, encoded, served, until
 
 pytestmark = pytest.mark.slow
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-SWITCHES = (
-    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update",
-)  # fmt: skip
 WATCH = """
 import os, sys
 def note(event, details):
@@ -57,27 +52,20 @@ class Page:
 
 
 @pytest.fixture(scope="module")
-def page(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def page(checkpoint: Path, browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     pytest.importorskip("gradio", reason="gradio is not installed")
-    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium to open the page with")
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "sitecustomize.py").write_text(WATCH)
     path = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
     environment = {"CALLS": str(folder / "calls"), "PYTHONPATH": path, "GRADIO_HEARTBEAT_INTERVAL": "0.5"}
     with served(checkpoint, folder, "max_upload_mb=0.1", **environment) as (process, url):
         yield Page(process, url, folder / "temporary", folder / "calls")
-
-
-@pytest.fixture(scope="module")
-def browser(page: Page) -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=list(SWITCHES))
-        yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module")

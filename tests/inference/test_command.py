@@ -103,7 +103,8 @@ def test_what_cannot_be_written_is_named_and_the_rest_is_done(tiny: Path, photos
     Image.fromarray(np.zeros((1, 60_000, 3), np.uint8)).save(photos / "line.png")
     for name in ("walk.avi", "run.avi"):
         film(photos / name, 5)
-    Path("out/walk_depth.mp4").mkdir(parents=True)
+    ending = next(codec.ending for codec in video.CODECS if video._works(codec, (64, 48)))
+    Path(f"out/walk_depth{ending}").mkdir(parents=True)
     Path("out/wide_side.jpg").mkdir()
     done = command("predict", f"checkpoint={tiny}", "input=photos", "formats=[npy,side,colour]", "output=out")
     assert done.code == 1
@@ -113,7 +114,7 @@ def test_what_cannot_be_written_is_named_and_the_rest_is_done(tiny: Path, photos
     assert "line.png': no side: a JPEG of" in done.err
     assert "walk.avi': its results cannot be written" in done.err
     assert Path("out/line_depth.npy").exists()
-    assert Path("out/run_depth.mp4").exists()
+    assert Path(f"out/run_depth{ending}").exists()
     assert "Traceback" not in done.err
 
 
@@ -151,8 +152,10 @@ def test_a_video_becomes_a_video(tiny: Path, tmp_path: Path, command: Command) -
     formats = "formats=[colour,side,png16]"
     done = command("predict", f"checkpoint={tiny}", "input=walk.mp4", formats, "smoothing=0.5", "output=out")
     assert done.code == 0, done.err
-    for name, wider in (("walk_depth.mp4", 1), ("walk_side.mp4", 2)):
-        reader = video.FrameReader(tmp_path / "out" / name)
+    for name, wider in (("walk_depth", 1), ("walk_side", 2)):
+        (path,) = (tmp_path / "out").glob(f"{name}.*")
+        assert re.search(rf"{path.name}: (H\.264|VP8), which browsers and phones play", done.err)
+        reader = video.FrameReader(path)
         frames = list(reader)
         assert len(frames) == 20
         assert reader.rate == pytest.approx(12)
