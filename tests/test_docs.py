@@ -57,7 +57,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(folder / f"mine/depths/{i}.png"), depth.astype(np.uint16) * 10)
     (folder / "nyu/index.csv").write_text("\n".join(rows) + "\n")
     (folder / "photos").mkdir()
-    cv2.imwrite(str(folder / "photos/a.jpg"), rng.integers(0, 255, (60, 90, 3), np.uint8))
+    for name in "abcdef":
+        cv2.imwrite(str(folder / f"photos/{name}.jpg"), rng.integers(0, 255, (60, 90, 3), np.uint8))
     cv2.imwrite(str(folder / "photo.jpg"), rng.integers(0, 255, (40, 50, 3), np.uint8))
     film = cv2.VideoWriter(str(folder / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
     for value in (20, 120, 220):
