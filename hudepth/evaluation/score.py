@@ -51,13 +51,23 @@ class ScoreOptions:
     """Whether to score trivial baselines too."""
 
 
+BEFORE = "before_training"
+"""Name among the predictors of the network that a training started from."""
+
+
 def score_checkpoint(
-    checkpoint: Checkpoint, options: ScoreOptions, *, output: Path, datamodule: DepthDataModule
+    checkpoint: Checkpoint,
+    options: ScoreOptions,
+    *,
+    output: Path,
+    datamodule: DepthDataModule,
+    before: nn.Module | None = None,
 ) -> dict[str, Metrics]:
     """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol.
 
     Below ``output`` it writes ``<protocol>/metrics.json``, ``per_image.csv``, ``panels.png`` and, if the protocol asks
-    for them, ``strata.csv`` and ``strata.png``. Returns metrics by protocol, predictor and name; empty except in the
+    for them, ``strata.csv`` and ``strata.png``. ``before`` is the network that the training started from, scored next
+    to it. Returns metrics by protocol, predictor and name; empty except in the
     first process.
     """
     import_trusted(options.trust)
@@ -73,7 +83,8 @@ def score_checkpoint(
     def draw(shown: Sequence[int]) -> list[Panel]:
         return make_panels(net, datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
 
-    return _score(net, protocols, options, output=output, datamodule=datamodule, origin=origin, draw=draw)
+    models = {MODEL: net} if before is None else {MODEL: net, BEFORE: before}
+    return _score(models, protocols, options, output=output, datamodule=datamodule, origin=origin, draw=draw)
 
 
 def score_predictions(
@@ -92,13 +103,13 @@ def score_predictions(
         return draw_beside(predict, datamodule.store, shown, max_depth_m=datamodule.max_depth_m)
 
     return _score(
-        predictions, protocols, options, output=output, datamodule=datamodule,
+        {MODEL: predictions}, protocols, options, output=output, datamodule=datamodule,
         origin=lambda: {"predictions": predictions.stamp()}, draw=draw,
     )  # fmt: skip
 
 
 def _score(
-    model: nn.Module,
+    models: Mapping[str, nn.Module],
     protocols: Sequence[Protocol],
     options: ScoreOptions,
     *,
@@ -107,8 +118,8 @@ def _score(
     origin: Callable[[], dict[str, Any]],
     draw: Callable[[Sequence[int]], list[Panel]],
 ) -> dict[str, Metrics]:
-    """Score a model and trivial baselines; ``origin`` states what it is, ``draw`` makes panels of store positions."""
-    predictors: dict[str, nn.Module] = {MODEL: model}
+    """Score models and trivial baselines; ``origin`` states what :data:`MODEL` is, ``draw`` makes its panels."""
+    predictors = dict(models)
     if options.baselines and not datamodule.split.train:
         log.info("no trivial baselines: data.split=%s has no training pairs to make them of", datamodule.split.kind)
     elif options.baselines:
@@ -124,6 +135,8 @@ def _score(
             results[protocol.name] = write_outputs(output / protocol.name, protocol, evaluation, datamodule, stamp)
         except ConfigError as error:  # the results of the other protocols are not lost
             failed.append(error)
+    for name, metrics in results.items():
+        _tell_change(name, metrics)
     if options.panels:
         panels = draw(evenly_spaced(evaluation.indices, options.panels))
         for name in results:
@@ -132,6 +145,18 @@ def _score(
         raise failed[0]
     log.info("tables and pictures: %s", output.resolve())
     return results
+
+
+def _tell_change(protocol: str, metrics: Metrics) -> None:
+    """Say what a training made of the network that it started from, and warn if that was better."""
+    if BEFORE not in metrics:
+        return
+    before, after = (metrics[name]["abs_rel"] for name in (BEFORE, MODEL))
+    if after > before:
+        text = "%s protocol: worse than the network it started from: abs_rel %.3f after training, %.3f before"
+        log.warning(text, protocol, after, before)
+    else:
+        log.info("%s protocol: abs_rel %.3f after training, %.3f before", protocol, after, before)
 
 
 def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options: Mapping[str, Any]) -> bool:

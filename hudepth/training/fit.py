@@ -28,7 +28,7 @@ from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint, read_plain
-from hudepth.training.initial import Parents, Training, restore_parents
+from hudepth.training.initial import Parents, Training, network_before, restore_parents
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
 from hudepth.training.options import memory_format
@@ -71,7 +71,8 @@ def fit(training: Training) -> float | None:
     elif options.test and trainer.is_global_zero:  # like hudepth-test does: on one device, in full precision
         tested = {**config, "trainer": {"accelerator": config["trainer"]["accelerator"]}}
         checkpoint = load_checkpoint(str(path))
-        score_checkpoint(checkpoint, parse(ScoreOptions, tested), output=path / "test", datamodule=data)
+        before = network_before(training, size=data.size, max_depth_m=data.max_depth_m)
+        score_checkpoint(checkpoint, parse(ScoreOptions, tested), output=path / "test", datamodule=data, before=before)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
     return None if best.best_model_score is None else float(best.best_model_score)
 

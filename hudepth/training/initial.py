@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
 from hudepth.base.console import log
+from hudepth.base.errors import HudepthError
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.lineage import BEFORE, lineage, refuse_training_pairs
+from hudepth.models.inference import inference_form
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint
 from hudepth.runs.run import CHECKPOINTS, LAST
@@ -52,6 +54,34 @@ def restore_parents(training: Training, net: nn.Module, data: DepthDataModule) -
         )  # fmt: skip
     parents: Parents = load_checkpoint(str(training.last)).data.get(BEFORE, [])
     return parents
+
+
+class Rescaled(nn.Module):
+    """A network whose unit depth is of another maximum depth: its output times ``factor``."""
+
+    def __init__(self, net: nn.Module, factor: float) -> None:
+        super().__init__()
+        self.net, self.factor = net, factor
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return depth / max_depth_m of this training."""
+        depth: Tensor = self.net(image)
+        return depth * self.factor
+
+
+def network_before(training: Training, *, size: tuple[int, int], max_depth_m: float) -> nn.Module | None:
+    """Return the network that a training started from with ``init=``; None without, or if it is not there any more."""
+    if not training.options.init or not training.options.baselines:
+        return None
+    try:
+        checkpoint = load_checkpoint(str(training.config["init"]), runs=training.config["paths"]["runs"])
+        net = checkpoint.build_net(trust=training.options.trust)
+        before_m = float(checkpoint.config["data"]["max_depth_m"])
+    except (HudepthError, KeyError, TypeError, ValueError) as error:
+        log.warning("the network before training is not scored: %s", error)
+        return None
+    net = inference_form(net, size=size)
+    return net if before_m == max_depth_m else Rescaled(net, before_m / max_depth_m)
 
 
 def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataModule) -> Parents:

@@ -16,6 +16,8 @@ import torch
 
 from hudepth.data.store import DepthStore
 from hudepth.runs.checkpoint import load_checkpoint
+from hudepth.training.initial import Training, network_before
+from hudepth.training.options import parse_options
 from tests.commands import TINY, Command, script
 
 QUIET = (*TINY, "callbacks.panels=0", "logger=none")
@@ -214,6 +216,35 @@ def test_training_can_start_from_another_run(command: Command, tmp_path: Path) -
     assert before["fingerprint"] == begun.data["fingerprint"] != went_on.data["fingerprint"]
     assert before["split"] == begun.split
     assert "in shares of" not in done.err
+
+
+@pytest.mark.parametrize(("changes", "worse"), [(["optim.lr=3"], True), (["data.max_depth_m=20"], None)])
+def test_the_network_before_training_is_scored_next_to_it(
+    changes: list[str], worse: bool | None, command: Command, trained: Path, tmp_path: Path
+) -> None:
+    shared = (*TINY, f"init={trained}", "trainer.max_epochs=1", "protocol=eigen", "logger=none")
+    done = command("train", *shared, *changes, "name=second")
+    assert done.code == 0, done.err
+    assert "before training" in done.out
+    metrics = json.loads((only_run(tmp_path, "second") / "test/eigen/metrics.json").read_text())["metrics"]
+    assert list(metrics)[:3] == ["model", "before_training", "nearest_frame"]
+    expected = json.loads((trained / "test/eigen/metrics.json").read_text())["metrics"]["model"]
+    for name, value in metrics["before_training"].items():  # edges are measured of the model alone
+        assert value == pytest.approx(expected[name], rel=1e-5), name
+    after, before = (metrics[name]["abs_rel"] for name in ("model", "before_training"))
+    told = f"abs_rel {after:.3f} after training, {before:.3f} before"
+    assert told in done.err
+    assert ("eigen protocol: worse than the network it started from: " in done.err) == (after > before)
+    assert worse is None or after > before
+
+
+def test_a_start_that_is_gone_is_told(trained: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    config = {**load_checkpoint(str(trained)).config, "init": str(tmp_path / "gone")}
+    training = Training(config, parse_options(config), tmp_path)
+    assert network_before(training, size=(32, 48), max_depth_m=10.0) is None
+    assert "the network before training is not scored: " in caplog.text
+    training = Training({**config, "init": None}, parse_options({**config, "init": None}), tmp_path)
+    assert network_before(training, size=(32, 48), max_depth_m=10.0) is None
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path, PurePosixPath
@@ -15,6 +16,12 @@ from hudepth.data.sources.base import Record, existing_root
 from hudepth.data.sources.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, OTHER_DEPTH_SUFFIXES, FileSource, inside
 from hudepth.data.sources.pairing import pair_up, printable, unique_keys, walk_files
 
+_IMAGE_WORDS, _DEPTH_WORDS = (
+    re.compile(rf"(.*/|)(?:(?:{words})(?:[_-]|(?=\d))(.+)|(.+)[_-](?:{words}))", re.IGNORECASE)
+    for words in ("rgb|colou?r|image|img", "sync_depth|depth|disparity|disp")
+)
+"""Names that begin or end with a word for what the file is."""
+
 
 @dataclass(eq=False)
 class FolderSource(FileSource):
@@ -22,8 +29,9 @@ class FolderSource(FileSource):
 
     ``images/kitchen/01.jpg`` belongs to ``depths/kitchen/01.png``, and its scene is ``kitchen``. With both
     folders ``.``, ``image_suffix="_rgb"`` and ``depth_suffix="_depth"``, ``01_rgb.jpg`` belongs to
-    ``01_depth.png``. Images are JPEG or PNG; depth maps are PNG of 8 or 16 bits, ``.npy``, TIFF or PFM.
-    Files of other kinds are ignored.
+    ``01_depth.png``. Where no names are equal, words that only say what a file is are left out: ``rgb_01.jpg`` belongs
+    to ``depth_01.png``, in one folder as in two. Images are JPEG or PNG; depth maps are PNG of 8 or 16 bits, ``.npy``,
+    TIFF or PFM. Files of other kinds are ignored.
 
     ``images`` and ``depths`` are relative to ``root``; suffixes end a name before its extension. ``encoding`` is
     required, since the files do not state it.
@@ -57,9 +65,8 @@ class FolderSource(FileSource):
         expects = f"'{self.images}/<name>{self.image_suffix}.jpg' with '{self.depths}/<name>{self.depth_suffix}.png'"
         frames: dict[str, int] = {}
         records = []
-        for key, image, depth in pair_up(
-            images, depths, root=root, expects=f"{expects} (or .npy, .tif)", unpaired=self.unpaired
-        ):
+        expects += " (or .npy, .tif), or 'rgb_<name>' with 'depth_<name>'; data=manifest reads a list of other names"
+        for key, image, depth in pair_up(images, depths, root=root, expects=expects, unpaired=self.unpaired):
             scene = PurePosixPath(key).parent.as_posix().removeprefix(".")
             frames[scene] = frames.get(scene, -1) + 1
             records.append(Record(id=key, scene=scene, frame=frames[scene], image=image, depth=depth))
@@ -72,19 +79,30 @@ class FolderSource(FileSource):
     def _find(self, root: Path) -> tuple[dict[str, str], dict[str, str]]:
         """Return the path of each image and of each depth map by their common name."""
         shared = PurePosixPath(self.images) == PurePosixPath(self.depths)
-        if shared and self.image_suffix == self.depth_suffix:
-            raise DataError(
-                f"data.source.images and data.source.depths are both '{self.images}', so images and depth maps cannot "
-                "be told apart. Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as they are named."
-            )
         images = self._list(root, self.images, self.image_suffix, IMAGE_SUFFIXES, what="images")
         depths = self._list(root, self.depths, self.depth_suffix, DEPTH_SUFFIXES, what="depths")
+        if shared and self.image_suffix == self.depth_suffix:
+            images, depths = _without_words(images, _IMAGE_WORDS), _without_words(depths, _DEPTH_WORDS)
+            if images and depths:
+                return unique_keys(images, what="image"), unique_keys(depths, what="depth")
+            raise DataError(
+                f"data.source.images and data.source.depths are both '{self.images}', so images and depth maps cannot "
+                "be told apart. Pass data.source.image_suffix=_rgb data.source.depth_suffix=_depth, as they are named, "
+                "or list the pairs for data=manifest."
+            )
         if not depths and not shared:
             depths = self._list(root, self.depths, self.depth_suffix, OTHER_DEPTH_SUFFIXES, what="depths")
         if shared:  # where one suffix ends with the other, the longer one decides
             longer, shorter = (depths, images) if len(self.depth_suffix) > len(self.image_suffix) else (images, depths)
             taken = {path for _, path in longer}
             shorter[:] = [(key, path) for key, path in shorter if path not in taken]
+        if not {key for key, _ in images} & {key for key, _ in depths}:
+            named = [
+                [*_without_words(files, words), *(file for file in files if not words.fullmatch(file[0]))]
+                for files, words in ((images, _IMAGE_WORDS), (depths, _DEPTH_WORDS))
+            ]
+            if {key for key, _ in named[0]} & {key for key, _ in named[1]}:
+                images, depths = named
         return unique_keys(images, what="image"), unique_keys(depths, what="depth")
 
     def _list(
@@ -106,3 +124,9 @@ class FolderSource(FileSource):
             for path in walk_files(base)
             if path.suffix.lower() in extensions and path.stem.endswith(suffix)
         ]
+
+
+def _without_words(files: Sequence[tuple[str, str]], words: re.Pattern[str]) -> list[tuple[str, str]]:
+    """Return (key, path) of the files whose names have such a word, without it."""
+    found = ((words.fullmatch(key), path) for key, path in files)
+    return [(f"{match[1]}{match[2] or match[3]}", path) for match, path in found if match]

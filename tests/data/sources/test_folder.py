@@ -18,6 +18,7 @@ from hudepth.data.sources.folder import FolderSource
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).uniform(0.5, 9, (6, 8)).astype(np.float32)
+MORE = ", or 'rgb_<name>' with 'depth_<name>'; data=manifest reads a list of other names."
 BOTH = {"images": ".", "depths": ".", "encoding": "float_m"}
 
 
@@ -83,7 +84,7 @@ def test_encoding_is_required(tmp_path: Path) -> None:
 
 def test_unpaired(tmp_path: Path) -> None:
     write(tmp_path, "images/a.jpg", "images/b.jpg", "images/c.jpg", "depths/a.png")
-    expects = "Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
+    expects = f"Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif){MORE}"
     skip = "Pass data.on_error=skip to leave them out."
     source = FolderSource(tmp_path, encoding="auto")
     assert refusal(source) == (
@@ -111,7 +112,8 @@ def test_roots_without_pairs(tmp_path: Path) -> None:
     )
     (tmp_path / "depths").mkdir()
     assert refusal(source) == (
-        f"data.root: no pairs in '{tmp_path}'. Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif)."
+        f"data.root: no pairs in '{tmp_path}'. "
+        f"Expected 'images/<name>.jpg' with 'depths/<name>.png' (or .npy, .tif){MORE}"
     )
 
 
@@ -119,6 +121,46 @@ def test_one_folder_needs_suffixes(tmp_path: Path) -> None:
     write(tmp_path, "a.jpg", "a.png")
     message = refusal(FolderSource(tmp_path, images=".", depths="./", encoding="auto"))
     assert "data.source.image_suffix=_rgb" in message
+
+
+@pytest.mark.parametrize(
+    ("images", "depths"),
+    [
+        (["images/rgb_1.jpg", "images/k/rgb_2.png"], ["depths/depth_1.png", "depths/k/depth_2.npy"]),
+        (["images/rgb1.jpg", "images/k/rgb2.png"], ["depths/depth1.png", "depths/k/depth2.npy"]),
+        (["images/1_color.jpg", "images/k/2_color.png"], ["depths/1-depth.png", "depths/k/2-depth.npy"]),
+        (["images/IMG_1.jpg", "images/k/IMG_2.png"], ["depths/1.png", "depths/k/2.npy"]),
+        (["images/1.jpg", "images/k/2.png"], ["depths/sync_depth_1.png", "depths/k/sync_depth_2.npy"]),
+    ],
+)
+def test_words_for_what_a_file_is_are_left_out(images: list[str], depths: list[str], tmp_path: Path) -> None:
+    write(tmp_path, *images, *depths)
+    records = FolderSource(tmp_path, encoding="float_m").records()
+    assert [(record.id, record.scene) for record in records] == [("1", ""), ("k/2", "k")]
+    assert [record.image for record in records] == images
+    assert [record.depth for record in records] == depths
+
+
+def test_words_in_one_folder(tmp_path: Path) -> None:
+    write(tmp_path, "k/rgb_1.png", "k/depth_1.png", "k/rgb_2.png", "k/depth_2.png", "k/mask_1.png")
+    records = FolderSource(tmp_path, images=".", depths=".", encoding="uint16_mm").records()
+    assert [(record.id, record.image, record.depth) for record in records] == [
+        (f"k/{i}", f"k/rgb_{i}.png", f"k/depth_{i}.png") for i in (1, 2)
+    ]
+
+
+def test_equal_names_keep_their_words(tmp_path: Path) -> None:
+    write(tmp_path, "images/rgb_1.jpg", "depths/rgb_1.png")
+    assert [record.id for record in FolderSource(tmp_path, encoding="auto").records()] == ["rgb_1"]
+    write(tmp_path, "images/x.jpg")
+    assert "1 of 2 images in" in refusal(FolderSource(tmp_path, encoding="auto"))
+
+
+def test_other_names_need_a_list(tmp_path: Path) -> None:
+    write(tmp_path, "images/left_1.jpg", "depths/laser_1.png")
+    message = refusal(FolderSource(tmp_path, encoding="auto"))
+    assert "1 of 1 images in" in message
+    assert "data=manifest reads a list of other names." in message
 
 
 def test_folders_stay_inside(tmp_path: Path) -> None:
