@@ -15,7 +15,7 @@ from hudepth.base.images import SUFFIXES
 VIDEO_SUFFIXES = (
     ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv",
 )  # fmt: skip
-UNREAD_SUFFIXES = (".heic", ".heif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
+UNREAD_SUFFIXES = (".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 """Photographs that are not decoded here: they are tried, so that each is listed with the reason."""
 _RESULT = re.compile(r".+_(depth|side)\.(png|jpg|mp4|webm)")  # as inference/depth_files.py names pictures
 
@@ -57,6 +57,8 @@ def find_inputs(spec: str, *, recursive: bool, output: Path | None = None) -> In
         if not files:
             wanted = "an image, folder, 'pattern', video or camera"
             raise DataError(f"input: no file, folder or match '{spec}'. Pass {wanted}.")
+    folders = [] if recursive else [f for f in files if f.is_dir() and f.name[0] != "." and not _is_same(f, output)]
+    hidden = [f for f in files if f.name.startswith(".") and f.suffix.lower() in (*SUFFIXES, *VIDEO_SUFFIXES)]
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
     alone = path.is_file()  # a file that is named is read, whatever its ending
     results = [] if alone else [file for file in files if _is_result(file, root, output)]
@@ -64,11 +66,11 @@ def find_inputs(spec: str, *, recursive: bool, output: Path | None = None) -> In
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     images = [f for f in files if f not in videos and (alone or _is_photo(f))]
     others = [file for file in files if file not in {*images, *videos}]
-    left_out = [
-        f"left out, {what}: {_names(found)}"
-        for what, found in (("results of hudepth-predict", results), ("neither image nor video", others))
-        if found
-    ]
+    reasons = {
+        "results of hudepth-predict": results, "neither image nor video": others, "hidden": hidden,
+        "subfolders, which recursive=true searches": folders,
+    }  # fmt: skip
+    left_out = [f"left out, {what}: {_names(found)}" for what, found in reasons.items() if found]
     if not images and not videos:
         below = "" if recursive else " Pass recursive=true to search subfolders."
         raise DataError(f"input: no image or video in '{spec}' ({', '.join(SUFFIXES + VIDEO_SUFFIXES)}).{below}")
@@ -79,6 +81,10 @@ def find_inputs(spec: str, *, recursive: bool, output: Path | None = None) -> In
             stems[file] = stem.with_name(file.name.replace(".", "_"))
     photos, films = ([Item(file, stems[file]) for file in found] for found in (images, videos))
     return Inputs(photos, films, left_out=tuple(left_out))
+
+
+def _is_same(folder: Path, output: Path | None) -> bool:
+    return output is not None and folder.resolve() == output.resolve()
 
 
 def _is_result(file: Path, root: Path, output: Path | None) -> bool:

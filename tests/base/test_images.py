@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import struct
 import zlib
@@ -12,10 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
+from hudepth.base.camera import Intrinsics
 from hudepth.base.errors import DataError
 from hudepth.base.images import as_rgb, read_photo
 
 RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
+SMOOTH = np.stack(np.broadcast_arrays(np.arange(120)[:, None], np.arange(200), 90), axis=-1).astype(np.uint8)
 
 
 def encoded(image: Image.Image, kind: str = "PNG", **options: object) -> bytes:
@@ -160,8 +163,95 @@ def test_tags_cannot_fill_the_memory(data: bytes) -> None:
         read_photo(data, where="x.jpg")
 
 
-def test_avif_is_read_and_heic_is_named() -> None:
+def test_avif_is_read() -> None:
     if features.check("avif"):
-        assert read_photo(encoded(Image.fromarray(RGB), "AVIF")).rgb.shape == RGB.shape
-    with pytest.raises(DataError, match=r"x\.heic: HEIC"):
+        photo = read_photo(encoded(Image.fromarray(SMOOTH), "AVIF", quality=95))
+        assert np.abs(photo.rgb.astype(int) - SMOOTH).mean() < 3
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + len(content), kind) + content
+
+
+def heic_with(copies: int, length: int) -> bytes:
+    """A HEIC whose EXIF items all lie over the same ``length`` bytes."""
+    data = encoded(Image.new("RGB", (64, 64), (9, 99, 9)), "HEIF")
+    at, parts = 0, {}
+    while at < len(data):
+        size, kind = struct.unpack_from(">I4s", data, at)
+        parts[kind] = data[at + 8 : at + size]
+        at += size
+    at, inner = 4, {}
+    while at < len(parts[b"meta"]):
+        size, kind = struct.unpack_from(">I4s", parts[b"meta"], at)
+        inner[kind] = parts[b"meta"][at + 8 : at + size]
+        at += size
+    numbers = range(2, 2 + copies)
+    infos = [inner[b"iinf"][6:], *(box(b"infe", struct.pack(">IHH4sx", 2 << 24, n, 0, b"Exif")) for n in numbers)]
+    inner[b"iinf"] = struct.pack(">IH", 0, len(infos)) + b"".join(infos)
+    inner[b"iref"] = bytes(4) + b"".join(box(b"cdsc", struct.pack(">HHH", n, 1, 1)) for n in numbers)
+    for _ in range(2):  # the first time for its size
+        start = 16 + len(parts[b"ftyp"]) + sum(8 + len(each) for each in inner.values()) + 4 + 8
+        places = [(1, start, len(parts[b"mdat"])), *((n, start + len(parts[b"mdat"]), length) for n in numbers)]
+        rows = b"".join(struct.pack(">HHHII", number, 0, 1, offset, size) for number, offset, size in places)
+        inner[b"iloc"] = struct.pack(">IBBH", 0, 0x44, 0, len(places)) + rows
+    meta = box(b"meta", bytes(4) + b"".join(box(kind, content) for kind, content in inner.items()))
+    exif = b"\0\0\0\x06Exif\0\0II*\0" + bytes(length - 14)
+    return box(b"ftyp", parts[b"ftyp"]) + meta + box(b"mdat", parts[b"mdat"] + exif)
+
+
+@pytest.fixture
+def heif() -> None:
+    """Where pillow-heif is installed, it writes HEIC, too."""
+    pytest.importorskip("pillow_heif", reason="pillow-heif is not installed").register_heif_opener()
+
+
+def camera_exif(orientation: int) -> bytes:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769)[0xA405] = 26  # FocalLengthIn35mmFilm
+    return exif.tobytes()
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+@pytest.mark.usefixtures("heif")
+def test_heic_is_read_upright_with_its_camera(orientation: int, turns: int) -> None:
+    photo = read_photo(encoded(Image.fromarray(SMOOTH), "HEIF", quality=95, exif=camera_exif(orientation)))
+    upright = np.rot90(SMOOTH, turns).astype(int)
+    assert photo.rgb.shape == upright.shape
+    assert np.abs(photo.rgb - upright).mean() < 3
+    assert isinstance(photo.camera, Intrinsics)
+    assert photo.camera.fx == pytest.approx(26 * math.hypot(120, 200) / math.hypot(36, 24))
+    assert photo.notes == ()
+
+
+@pytest.mark.usefixtures("heif")
+def test_heic_has_the_same_limits() -> None:
+    data = encoded(Image.fromarray(SMOOTH), "HEIF")
+    assert read_photo(data, where="x.heic").rgb.shape == (120, 200, 3)
+    with pytest.raises(DataError, match=r"x\.heic: 200 x 120 pixels, allowed are 1 to 0\.02 million"):
+        read_photo(data, where="x.heic", max_pixels=20_000)
+    at = data.index(b"ispe") + 8  # states fewer pixels than there are
+    with pytest.raises(DataError, match=r"x\.heic: "):
+        read_photo(data[:at] + struct.pack(">II", 20, 12) + data[at + 8 :], where="x.heic", max_pixels=20_000)
+    for cut in (12, 40, len(data) // 2, len(data) - 9):
+        with pytest.raises(DataError, match=r"x\.heic: (a HEIC that pillow-heif cannot read|.*truncated or damaged)"):
+            read_photo(data[:cut], where="x.heic")
+
+
+@pytest.mark.usefixtures("heif")
+def test_items_of_a_heic_cannot_fill_the_memory() -> None:
+    assert read_photo(heic_with(3, 5000)).rgb.shape == (64, 64, 3)
+    with pytest.raises(DataError, match=r"x\.heic: its tags .EXIF. overlap"):
+        read_photo(heic_with(50, 100_000), where="x.heic")
+    endless = box(b"ftyp", b"heic" + bytes(8)) + box(b"meta", bytes(4) + box(b"iloc", b"\2" + b"\0" * 5 + b"\xff" * 99))
+    with pytest.raises(DataError, match=r"x\.heic: "):
+        read_photo(endless, where="x.heic")
+
+
+def test_heic_without_pillow_heif_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(DataError, match=r"x\.heic: HEIC is read with pillow-heif\. Run pip install 'hudepth\[heif\]'"):
         read_photo(b"\0\0\0\x18ftypheic" + bytes(40), where="x.heic")
+    with pytest.raises(DataError, match=r"x\.jpg: no image that can be read\. Pass a JPEG"):
+        read_photo(b"\0\0\0\x18ftypisom" + bytes(40), where="x.jpg")

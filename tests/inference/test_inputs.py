@@ -65,8 +65,13 @@ def test_photographs_by_phones_and_what_is_left_out(folder: Path) -> None:
     images = {item.path.name for item in found.images}
     assert {"p.HEIC", "p.avif", "p.jfif", "bare"} <= images
     assert "p.MTS" in {item.path.name for item in found.videos}
-    (line,) = found.left_out
-    assert "2 (Makefile, notes.txt)" in line
+    assert found.left_out == (
+        "left out, neither image nor video: 2 (Makefile, notes.txt)",
+        "left out, hidden: 1 (.hidden.jpg)",
+        "left out, subfolders, which recursive=true searches: 1 (sub)",
+    )
+    without = find_inputs(str(folder), recursive=True, output=folder / "sub").left_out
+    assert [line.split(":")[0] for line in without if "subfolders" in line] == []
 
 
 def test_nothing(folder: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,48 +10,21 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
-from PIL import (
-    AvifImagePlugin,
-    BmpImagePlugin,
-    GifImagePlugin,
-    Image,
-    JpegImagePlugin,
-    PngImagePlugin,
-    PpmImagePlugin,
-    TiffImagePlugin,
-    UnidentifiedImageError,
-    WebPImagePlugin,
-    features,
-)
+from PIL import Image, UnidentifiedImageError
 
-from hudepth.base.camera.exif import directory, exif_camera, orientation
+from hudepth.base.camera.exif import exif_camera, orientation
 from hudepth.base.camera.intrinsics import Intrinsics
 from hudepth.base.errors import DataError
+from hudepth.base.images.files import MAX_PIXELS, check_pixels, read_bytes
+from hudepth.base.images.formats import FORMATS, formats_of, why_unread
+from hudepth.base.images.tags import check_tags
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it cannot read becomes an error of one line
-_PLUGINS = (
-    JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin, TiffImagePlugin, GifImagePlugin,
-    PpmImagePlugin, *([AvifImagePlugin] if features.check("avif") else []),
-)  # fmt: skip
-FORMATS = tuple(plugin.__name__.rpartition(".")[2].removesuffix("ImagePlugin").upper() for plugin in _PLUGINS)
-"""What is decoded. Pillow would also take formats that start other programs, as EPS does Ghostscript."""
-SUFFIXES = (
-    ".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff", ".gif", ".ppm", ".pgm",
-)  # fmt: skip
-"""Extensions that are looked for in folders, in lower case."""
-
-MAX_NATIVE_PIXELS = 25_000_000
-"""Of a ground truth that is scored, which takes some 50 bytes a pixel. The largest public ones have 24 million."""
-MAX_PIXELS = 100_000_000
-"""Larger images are refused before they are decoded."""
-_MAX_EXIF = 1 << 20  # bytes; a segment of a JPEG holds 65,533
 _TURNS = {  # by orientation: what brings it upright
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
     5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }  # fmt: skip
-MAX_FILE_BYTES = 1 << 30
-"""Larger files are refused before they are read."""
 
 
 class Photo(NamedTuple):
@@ -86,19 +57,18 @@ def read_photo(source: str | Path | bytes, *, where: str = "", max_pixels: int =
     if not data:
         raise DataError(f"{where}: the file is empty (0 bytes). Copy it again.")
     try:
-        _check_tags(data, where)
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        check_tags(data, where)
+        with Image.open(io.BytesIO(data), formats=formats_of(data)) as image:
             check_pixels(image.height, image.width, where=where, most=max_pixels)
             notes = _notes(image)
             image.load()
-            exif = data if image.format == "TIFF" else bytes(image.info.get("exif", b"")).removeprefix(b"Exif\0\0")
+            exif = data if image.format == "TIFF" else bytes(image.info.get("exif") or b"").removeprefix(b"Exif\0\0")
             turn = _TURNS.get(orientation(exif))
             rgb = pillow_rgb(image if turn is None else image.transpose(turn), where=where)
     except DataError:
         raise
     except UnidentifiedImageError:
-        kind = "HEIC and its like are not read here" if data[4:8] == b"ftyp" else "no image that can be read"
-        raise DataError(f"{where}: {kind}. Pass a {', '.join(FORMATS)}.") from None
+        raise DataError(f"{where}: {why_unread(data)} Pass a {', '.join(FORMATS)}.") from None
     except Image.DecompressionBombError:
         raise DataError(f"{where}: more pixels than are decoded here. Resize the file.") from None
     except Exception as error:  # decoders know dozens of ways in which a file can be broken
@@ -111,7 +81,7 @@ def _notes(image: Image.Image) -> tuple[str, ...]:
     if image.format == "TIFF":  # counting its pages would read all their tags
         return ()
     frames = int(getattr(image, "n_frames", 1))
-    animated = frames > 1 and image.format != "MPO"  # whose further frames are thumbnails or a second eye
+    animated = frames > 1 and image.format not in ("MPO", "HEIF")  # which add a second eye, or a burst
     return (f"animated, {frames} frames: the first is taken",) if animated else ()
 
 
@@ -127,27 +97,6 @@ def pillow_rgb(image: Image.Image, *, where: str = "image") -> UInt8[np.ndarray,
         rgba = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", rgba.size, (255, 255, 255, 255)), rgba)
     return np.asarray(image.convert("RGB"), np.uint8)
-
-
-def _check_tags(data: bytes, where: str) -> None:
-    """Refuse overlapping tags of a TIFF or of EXIF: Pillow copies each, so a small file would fill the memory."""
-    jpeg = _jpeg_exif(data) if data[:2] == b"\xff\xd8" else b""
-    starts = [m.start() for m in islice(re.finditer(rb"II\*\0|MM\0\*", data), 9)] if data[4:8] == b"ftyp" else [0]
-    blocks = [memoryview(jpeg or data)[at:] for at in starts]  # of an AVIF, from where its EXIF may begin
-    overlap = any(sum(min(tag.size, len(each)) for tag in directory(each).values()) > 4 * len(each) for each in blocks)
-    if overlap or len(jpeg) > _MAX_EXIF or len(blocks) > 8:
-        raise DataError(f"{where}: its tags (EXIF) overlap or are too many. Save the picture again without them.")
-
-
-def _jpeg_exif(data: bytes) -> bytes:
-    """Return the EXIF block of a JPEG file: its segments one after another, as Pillow joins them."""
-    at, parts = 2, []
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        length = -1 if data[at + 1] == 0xFF else int.from_bytes(data[at + 2 : at + 4], "big")  # -1: a fill byte
-        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
-            parts.append(data[at + 10 : at + 2 + length])
-        at += 2 + length
-    return b"".join(parts)
 
 
 def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
@@ -175,43 +124,6 @@ def as_rgb(array: NDArray[Any], *, where: str = "image") -> UInt8[np.ndarray, "h
         alpha = array[..., 3:].astype(np.float32) / 255
         array = np.rint(array[..., :3] * alpha + 255 * (1 - alpha))
     return np.ascontiguousarray(array, np.uint8)
-
-
-def read_bytes(path: Path) -> bytes:
-    """Read a whole file of at most :data:`MAX_FILE_BYTES`.
-
-    Raises:
-        DataError: if it is missing, too large or unreadable.
-    """
-    check_file(path)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"'{path}': cannot be read ({error.strerror}). Check its permissions.") from None
-
-
-def check_pixels(height: int, width: int, *, where: str, most: int = MAX_PIXELS) -> None:
-    """Accept sizes of 1 to ``most`` pixels.
-
-    Raises:
-        DataError: for any other size.
-    """
-    if not 0 < height * width <= most:
-        raise DataError(
-            f"{where}: {width} x {height} pixels, allowed are 1 to {most / 1e6:g} million. Resize the file."
-        )
-
-
-def check_file(path: Path) -> None:
-    """Check that a file is there and not too large to read.
-
-    Raises:
-        DataError: if it is missing or larger than :data:`MAX_FILE_BYTES`.
-    """
-    if not path.is_file():
-        raise DataError(f"no file '{path}'. Copy it there, or take it off the list.")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise DataError(f"'{path}': larger than {MAX_FILE_BYTES >> 20} MiB. It cannot be one depth map or list.")
 
 
 def resize_image(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
