@@ -60,7 +60,7 @@ class FilePredictions(nn.Module):
         super().__init__()
         self.options, self._store, self._size = options, datamodule.store, datamodule.size
         test = datamodule.split.test
-        files = _find(options.predictions, [self._store.records[row] for row in test])
+        files = _find(options.predictions, [self._store.records[row] for row in test], self._store.records)
         self.files = dict(zip(test, files, strict=True))
         self._check([self._sample(row) for row in evenly_spaced(test, _SAMPLES)])
 
@@ -173,32 +173,31 @@ class FilePredictions(nn.Module):
         return f"per_m={best}, or " if off and off[best] < np.log(1.5) else ""
 
 
-def _find(folder: Path, records: Sequence[Record]) -> list[Path]:
-    """Return the file of each record; DataError if some have none, a warning for files that are of none."""
+def _find(folder: Path, test: Sequence[Record], every: Sequence[Record]) -> list[Path]:
+    """Return the file of each test pair; DataError if some have none, and a warning of files that are of no pair."""
     if not folder.is_dir():
         raise DataError(f"predictions: no folder '{folder}'. Pass predictions=<folder of npy or 16-bit png files>.")
     there = [path for path in walk_files(folder) if path.suffix.lower() in SUFFIXES]
     found = {f"{path.with_suffix('')}{path.suffix.lower()}": folder / path for path in there}
-    names = [_names(record) for record in records]
-    taken = Counter(name for each in names for name in each)
-    files, missing = [], []
-    for record, each in zip(records, names, strict=True):
-        stems = [f"{name}{ending}" for name in each if taken[name] == 1 for ending in ("", ENDING)]
-        file = next((found[key] for stem in stems for suffix in SUFFIXES if (key := f"{stem}{suffix}") in found), None)
-        if file is None:
-            missing.append(record)
-        else:
-            files.append(file)
-    if missing:
+    shared = Counter(name for record in test for name in _names(record))
+    names = ([f"{stem}{suffix}" for stem in _stems(record, shared) for suffix in SUFFIXES] for record in test)
+    files = [next((found[name] for name in each if name in found), None) for each in names]
+    if missing := [record for record, file in zip(test, files, strict=True) if file is None]:
         wanted = " or ".join(f"'{name}.npy'" for name in _names(missing[0])[:2])
         raise DataError(
-            f"predictions: {len(missing)} of {len(records)} test pairs have no file in '{folder}', the first is "
+            f"predictions: {len(missing)} of {len(test)} test pairs have no file in '{folder}', the first is "
             f"'{missing[0].id}': no {wanted}, nor .png. Predict them, or pass the data.split= they are of."
         )
-    if surplus := sorted(str(file.relative_to(folder)) for file in {*found.values()} - {*files}):
-        text = "predictions: %d of %d files in '%s' are of no test pair, or not the first of one; left out, as '%s'"
-        log.warning(text, len(surplus), len(found), folder, surplus[0])
-    return files
+    known = {stem for record in every for stem in _stems(record, Counter())}
+    if strange := sorted(str(path) for path in there if path.with_suffix("").as_posix() not in known):
+        text = "predictions: %d of %d files in '%s' are of no pair of the data, the first is '%s'; left out"
+        log.warning(text, len(strange), len(there), folder, strange[0])
+    return [file for file in files if file]
+
+
+def _stems(record: Record, shared: Counter[str]) -> list[str]:
+    """Return the names that a pair's file may have, without extension, and that no other pair's may."""
+    return [f"{name}{ending}" for name in _names(record) if shared[name] <= 1 for ending in ("", ENDING)]
 
 
 def _names(record: Record) -> list[str]:

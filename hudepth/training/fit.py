@@ -86,7 +86,8 @@ def build_datamodule(training: Training) -> DepthDataModule:
     teacher = {"teacher": distill["teacher"]} if has_target(distill) else {}
     data = build_data({**config["data"], **teacher}, trust=trust, augment=config.get("augment"))
     if data.source.name == "rooms":
-        log.info("data: built-in rooms (the default). For real depth pass data=nyu_labeled data.root=<folder>.")
+        real = "hudepth-data download data=nyu_labeled_mat data.root=nyu"
+        log.info("data: built-in rooms (the default). For real depth: %s", real)
     if training.options.test:
         build_protocols(config["protocol"], datamodule=data, trust=trust)
     return data

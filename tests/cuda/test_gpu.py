@@ -13,6 +13,7 @@ import torch
 import hudepth
 from hudepth.base.wording import one_line
 from hudepth.inference.model import DepthModel
+from hudepth.metrics.scale import scale_errors
 from hudepth.runs.checkpoint import read_plain
 from tests.commands import Command, Result
 from tests.networks import write_tiny_checkpoint
@@ -136,3 +137,10 @@ def test_every_way_to_run_it_is_measured(command: Command, tmp_path: Path) -> No
     for row in content["rows"]:
         assert row["difference_mm"] < (100 if row["contender"] in ("fp16", "bf16") else 5)
         assert row["share_of_peak"] is not None
+
+
+def test_scales_of_images_are_those_of_a_cpu() -> None:
+    truth = torch.rand(3, 1, 31, 40) + 0.5
+    pred, valid = truth * torch.tensor([0.5, 1.0, 3.0])[:, None, None, None] + 0.1 * torch.rand_like(truth), truth > 0.7
+    found = scale_errors(pred.to(GPU), truth.to(GPU), valid.to(GPU)).cpu()
+    torch.testing.assert_close(found, scale_errors(pred, truth, valid), rtol=1e-5, atol=1e-6)

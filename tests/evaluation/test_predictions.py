@@ -15,7 +15,10 @@ import pytest
 from numpy.typing import NDArray
 
 import hudepth
+from hudepth.base.errors import DataError
+from hudepth.data.sources.base import Record
 from hudepth.data.sources.rooms import RoomsSource
+from hudepth.evaluation.predictions import _find
 from hudepth.runs.results import find_result
 from tests.commands import TINY, Command, Result
 
@@ -67,7 +70,7 @@ def test_our_own_predictions_give_the_figures_of_their_checkpoint(
     assert document["predictions"] == {
         "folder": str((own / kind).resolve()), "kind": "metric", "per_m": None, "files": 2,
     }  # fmt: skip
-    assert "10 of 12 files" in done.err
+    assert "are of no pair" not in done.err  # the others are of training pairs
     compared = command("report", "compare", f"a={trained}", f"b=test_{kind}", "repeats=100", "output=c")
     assert compared.code == 0, compared.err
     rows = json.loads((tmp_path / "c" / "compare.json").read_text())["metrics"]
@@ -324,13 +327,25 @@ def test_likely_mistakes_are_warned_of(score: Callable[..., Result], tmp_path: P
     done = score("kind=affine_depth")
     assert done.code == 0
     assert "look like inverse depth (correlation with the truth -0." in done.err
-    assert "1 of 4 files in 'p' are of no test pair, or not the first of one; left out, as 'other.npy'" in done.err
+    assert "1 of 4 files in 'p' are of no pair of the data, the first is 'other.npy'; left out" in done.err
     write(tmp_path / "p", PREDICTIONS)
     assert "look like depth (correlation with the truth 0." in score("kind=affine_disparity").err
     for i, depth in enumerate(PREDICTIONS):
         (tmp_path / "p" / f"rgb_{i}.npy").unlink()
         cv2.imwrite(str(tmp_path / "p" / f"rgb_{i}_depth.png"), np.rint(depth * 256).astype(np.uint16))
     assert "Pass per_m=256, or kind=" in score().err
+
+
+def test_names_that_several_pairs_have_need_their_folders(tmp_path: Path) -> None:
+    records = [Record(id=f"{i}", scene=s, frame=0, image=f"{s}/rgb_0.jpg") for i, s in enumerate(("bath", "hall"))]
+    (tmp_path / "rgb_0.npy").touch()
+    with pytest.raises(DataError, match=r"2 of 2 test pairs .* no '0\.npy' or 'bath/rgb_0\.npy', nor \.png"):
+        _find(tmp_path, records, records)
+    for name in ("bath_rgb_0.png", "bath_rgb_0_depth.NPY", "1.pfm", "1_depth.npy"):
+        (tmp_path / name).touch()
+    # the id comes first, then the image; without _depth before with it; npy before pfm before png
+    assert [path.name for path in _find(tmp_path, records, records)] == ["bath_rgb_0.png", "1.pfm"]
+    assert [path.name for path in _find(tmp_path, records[:1], records)] == ["bath_rgb_0.png"]
 
 
 def test_predictions_need_to_know_their_data(command: Command, tmp_path: Path) -> None:
