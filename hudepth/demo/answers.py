@@ -89,7 +89,7 @@ def reduce_depth(depth: DepthMap, max_side: int = MAX_SIDE) -> DepthMap:
     centres = [((np.arange(n) + 0.5) * (length / n)).astype(np.intp) for n, length in pairs]
     image = resize_image(depth.image, (rows, columns))
     camera = depth.camera and depth.camera.scale(columns / shape[1], rows / shape[0])
-    return replace(depth, metres=depth.metres[np.ix_(*centres)], image=image, camera=camera)
+    return replace(depth, metres=depth.metres[np.ix_(*centres)], image=image, camera=camera, uncertainty_m=None)
 
 
 def colour_table() -> UInt8[np.ndarray, "256 3"]:

@@ -22,6 +22,7 @@ from hudepth.metrics.catalogue import Level, metric_info, metric_names
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.strata import strata_csv, summarise_strata
 from hudepth.metrics.summary import ImageTable, per_image_csv, summarise
+from hudepth.metrics.uncertainty import UNCERTAINTY_NAMES
 from hudepth.runs.results import METRICS, MODEL, PER_IMAGE
 from hudepth.viz.strata import save_strata
 
@@ -40,9 +41,13 @@ def write_outputs(
     counts.
     """
     records = [datamodule.store.records[index] for index in evaluation.indices]
-    boundary = {MODEL: evaluation.boundary.get(protocol.name)}
+    only_model: dict[str, Any] = {
+        "boundary": evaluation.boundary.get(protocol.name), "uncertainty": evaluation.uncertainty.get(protocol.name),
+    }  # fmt: skip
     tables = {
-        name: image_table(protocol, evaluation.sums[name, protocol.name], records, boundary=boundary.get(name))
+        name: image_table(
+            protocol, evaluation.sums[name, protocol.name], records, **(only_model if name == MODEL else {})
+        )
         for name in evaluation.predictors
     }
     model = tables[MODEL]
@@ -70,6 +75,9 @@ def write_outputs(
         save_strata(folder / "strata.png", rows, title=title)
     over = f"{uncertainty['scenes']} {'scenes' if any(model.scenes) else 'images of unknown scenes'}"
     print_results(metrics, ranges[MODEL], over=over, title=title)
+    if "flip_ause" in metrics[MODEL]:
+        found = (metrics[MODEL][name] for name in UNCERTAINTY_NAMES)
+        log.info("disagreement with the mirrored image: AUSE %.3f, rank correlation with the error %.2f", *found)
     return metrics
 
 

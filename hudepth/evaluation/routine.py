@@ -47,6 +47,7 @@ class Evaluation(LightningModule):
         self.sums: dict[tuple[str, str], Float[Tensor, "n k"]] = {}
         """By predictor and protocol; the others by protocol, of the detailed predictor."""
         self.boundary: dict[str, Float[Tensor, "n k"]] = {}
+        self.uncertainty: dict[str, Float[Tensor, "n k"]] = {}
         self.strata: dict[str, Float[Tensor, "n bins k"]] = {}
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
@@ -56,15 +57,19 @@ class Evaluation(LightningModule):
         for name, predictor in self.predictors.items():
             if isinstance(predictor, FilePredictions):
                 plain_scores = flipped_scores = BatchScores(predictor.read(batch), truth, inverse=predictor.inverse)
+                spread = None
             else:
                 plain, flipped = self._predict(predictor, batch["image"])
                 plain_scores = BatchScores(plain, truth)
                 flipped_scores = plain_scores if flipped is None else BatchScores(flipped, truth)
+                spread = None if flipped is None else BatchScores((plain - flipped).abs(), truth)
             for protocol in self.protocols:
                 scores = flipped_scores if protocol.flip else plain_scores
                 self._keep(scores.sums(protocol), "sums", name, protocol.name)
                 if name == self.detailed and protocol.boundary:
                     self._keep(scores.boundary(protocol), "boundary", protocol.name)
+                if name == self.detailed and protocol.flip and spread is not None:
+                    self._keep(scores.uncertainty(protocol, spread), "uncertainty", protocol.name)
                 if name == self.detailed and protocol.strata:
                     self._keep(scores.strata(protocol), "strata", protocol.name)
 
@@ -89,7 +94,7 @@ class Evaluation(LightningModule):
             if kind == "sums":
                 self.sums[rest[0], rest[1]] = rows[order]
             else:
-                {"boundary": self.boundary, "strata": self.strata}[kind][rest[0]] = rows[order]
+                getattr(self, kind)[rest[0]] = rows[order]
 
     def _gathered(self, own: list[Tensor]) -> list[Tensor]:
         if self.trainer.world_size == 1:

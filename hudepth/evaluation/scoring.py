@@ -20,6 +20,7 @@ from hudepth.metrics.depth import depth_metrics_from_sums
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.strata import strata_sums
 from hudepth.metrics.summary import LOG_BIAS, ImageTable
+from hudepth.metrics.uncertainty import UNCERTAINTY_NAMES, uncertainty_metrics
 
 
 class BatchTruth:
@@ -70,6 +71,14 @@ class BatchScores:
         """Return the boundary metrics of each image, columns as in :data:`hudepth.metrics.boundary.BOUNDARY_NAMES`."""
         return torch.cat([torch.stack([*boundary_metrics(*x).values()], dim=1) for x in self._cropped(protocol)])
 
+    def uncertainty(self, protocol: Protocol, spread: BatchScores) -> Float[Tensor, "b k"]:
+        """Return columns of :data:`hudepth.metrics.uncertainty.UNCERTAINTY_NAMES`; ``spread`` holds uncertainties."""
+        rows = []
+        for (pred_m, truth_m, counts), unsure in zip(self._cropped(protocol), spread._scored(protocol), strict=True):
+            window = protocol.window(*unsure.pred_m.shape[-2:]) or (slice(None), slice(None))
+            rows.append(uncertainty_metrics(pred_m, truth_m, counts, unsure.pred_m[..., *window]))
+        return torch.cat(rows)
+
     def strata(self, protocol: Protocol) -> Float[Tensor, "b bins k"]:
         """Return the sums of each image over the bins of :data:`hudepth.metrics.strata.STRATA`."""
         return torch.cat([strata_sums(*x) for x in self._cropped(protocol)])
@@ -115,14 +124,17 @@ def image_table(
     records: Sequence[Record],
     *,
     boundary: Float[Tensor, "n e"] | None = None,
+    uncertainty: Float[Tensor, "n u"] | None = None,
 ) -> ImageTable:
-    """Turn rows of :meth:`BatchScores.sums` and :meth:`BatchScores.boundary` into the metrics of each image."""
+    """Turn rows of the methods of :class:`BatchScores` into the metrics of each image."""
     columns = dict(zip((*SUM_COLUMNS, *registered_functions()), sums.T, strict=True))
     others = {name: columns.pop(name) for name in (*IMAGE_COLUMNS, *registered_functions())}
     values = depth_metrics_from_sums(columns, silog_lambda=protocol.silog_lambda, silog_factor=protocol.silog_factor)
     values |= {LOG_BIAS: columns["log"] / columns["count"], **others}
     if boundary is not None:
         values |= dict(zip(BOUNDARY_NAMES, boundary.T, strict=True))
+    if uncertainty is not None:
+        values |= dict(zip(UNCERTAINTY_NAMES, uncertainty.T, strict=True))
     return ImageTable(
         ids=[record.id for record in records],
         scenes=[record.scene for record in records],

@@ -47,6 +47,7 @@ class PredictOptions(ModelOptions):
     )
     points: Annotated[int, Range(1)] | None = None
     edges: bool = False
+    max_uncertainty: Annotated[float, Range(0, above=True)] | None = None
     smoothing: Annotated[float, Range(0, 1, below=True)] = 0.0
     frames: Annotated[int, Range(1)] | None = None
     batch_size: Annotated[int, Range(1)] | None = None
@@ -55,11 +56,15 @@ class PredictOptions(ModelOptions):
         if self.scale_m != "auto" and not 0 <= self.scale_m[0] < self.scale_m[1]:
             near, far = self.scale_m
             raise ConfigError(f"scale_m: [{near:g},{far:g}] is not rising distances in metres. Pass scale_m=[0,10].")
+        asks = "formats: uncertainty" if "uncertainty" in (self.formats or []) else ""
+        if not self.flip and (asks := "max_uncertainty" if self.max_uncertainty else asks):
+            raise ConfigError(f"{asks} needs the mirrored image's prediction, too. Pass flip=true.")
 
     @property
     def style(self) -> Style:
         """What pictures and point clouds have in common."""
-        return Style(None if self.scale_m == "auto" else self.scale_m, points=self.points, edges=self.edges)
+        scale_m = None if self.scale_m == "auto" else self.scale_m
+        return Style(scale_m, points=self.points, edges=self.edges, max_uncertainty=self.max_uncertainty)
 
 
 @dataclass(frozen=True)
@@ -216,13 +221,13 @@ def _report(job: Job, *, seconds: float) -> None:
     log.info("%d predicted in %.1f s (%.1f per second): %s", tally.done, seconds, rate, job.output.resolve())
     record = {
         "model": {"name": info.name, "parameters": info.parameters, "epoch": info.epoch, **info.trained_on},
-        "units": {"png16": "mm", "npy": "m", "ply": "m", "glb": "m"},
+        "units": {"png16": "mm", "npy": "m", "uncertainty": "m", "ply": "m", "glb": "m"},
         "network_size": list(info.size), "fit": job.model.fit,
         "max_depth_m": info.max_depth_m,
         "calibration": info.calibration and asdict(info.calibration), "backend": job.model.backend.name,
         "settings": {
             "input": options.input, "camera": options.camera, "smoothing": options.smoothing,
-            "precision": options.precision, "frames": options.frames,
+            "precision": options.precision, "frames": options.frames, "max_uncertainty": options.max_uncertainty,
         },
         "cameras": job.cameras, "scale_m": options.scale_m, "predicted": tally.done, "failed": tally.failed,
     }  # fmt: skip

@@ -20,16 +20,18 @@ class Style:
     scale_m: tuple[float, float] | None = None  # ends of the colour scale [m]; None: each picture its own
     points: int | None = None  # at most so many in a point cloud
     edges: bool = False  # whether a point cloud has those of depth edges
+    max_uncertainty: float | None = None  # of points, as a share of their depth; others are left out
 
     def points_of(self, depth: DepthMap) -> PointCloud:
         """Return the points of a depth map that are written."""
-        cloud = depth.point_cloud(edges=self.edges)
+        cloud = depth.point_cloud(edges=self.edges, max_uncertainty=self.max_uncertainty)
         return cloud if self.points is None else cloud.thin(self.points)
 
 
 FORMATS: dict[str, tuple[str, Callable[[DepthMap, IO[bytes], Style], object]]] = {
     "png16": ("_depth.png", lambda depth, file, _: file.write(depth.to_png16())),
     "npy": ("_depth.npy", lambda depth, file, _: file.write(depth.to_npy())),
+    "uncertainty": ("_uncertainty.npy", lambda depth, file, _: file.write(depth.uncertainty_to_npy())),
     "colour": ("_depth.jpg", lambda depth, file, style: file.write(jpeg(depth.colourise(scale_m=style.scale_m)))),
     "side": ("_side.jpg", lambda depth, file, style: file.write(jpeg(depth.side_by_side(scale_m=style.scale_m)))),
     "ply": ("_depth.ply", lambda depth, file, style: file.write(style.points_of(depth).to_ply())),

@@ -40,6 +40,7 @@ class DepthMap:
     notes: tuple[str, ...] = ()  # what reading changed in the image, if it is not obvious
     camera: Intrinsics | None = None  # which took the image, in its pixels, or is assumed; None: NYU's is
     camera_factor: float = 1.0  # by which the network's depth was multiplied for that camera
+    uncertainty_m: Float[np.ndarray, "h w"] | None = None  # with flip: half the difference of the two predictions [m]
 
     def __repr__(self) -> str:
         height, width = self.metres.shape
@@ -107,25 +108,45 @@ class DepthMap:
         """Return the image with its coloured depth to the right; ``scale_m`` as in :meth:`colourise`."""
         return np.hstack([self.image, self.colourise(scale_m=scale_m)])
 
-    def point_cloud(self, camera: CameraLike | None = None, *, edges: bool = True) -> PointCloud:
+    def point_cloud(
+        self, camera: CameraLike | None = None, *, edges: bool = True, max_uncertainty: float | None = None
+    ) -> PointCloud:
         """Return one coloured point per pixel, by default with the camera that the depth was predicted for.
 
-        ``edges`` false leaves out pixels at depth edges, whose points fly between two surfaces. Another ``camera``, as
+        ``edges`` false leaves out pixels at depth edges, whose points fly between two surfaces; ``max_uncertainty``
+        those whose uncertainty exceeds this share of their depth. Another ``camera``, as
         :func:`hudepth.load` takes it, moves the points to the sides and leaves depth as it is. Raises ConfigError if it
         cannot be of this picture, TypeError if it is no camera.
         """
+        sure = None
+        if max_uncertainty is not None:
+            sure = self._uncertainty() <= np.float32(max_uncertainty) * self.metres
         shape = self.metres.shape
         chosen = None if camera is None else CameraChoice.of(camera).of_picture(*shape)
         if chosen is not None:
-            return point_cloud(self.metres, self.image, chosen, edges=edges)
-        cloud = point_cloud(self.metres, self.image, self.camera, edges=edges)
+            return point_cloud(self.metres, self.image, chosen, edges=edges, kept=sure)
+        cloud = point_cloud(self.metres, self.image, self.camera, edges=edges, kept=sure)
         return replace(cloud, comment=cloud.comment + self._factor_words)
 
     def to_npy(self) -> bytes:
-        """Return a .npy file in metres. NumPy, writing one itself, does not say why it cannot."""
-        memory = io.BytesIO()
-        np.save(memory, self.metres)
-        return memory.getvalue()
+        """Return a .npy file in metres."""
+        return _npy(self.metres)
+
+    def uncertainty_to_npy(self) -> bytes:
+        """Return the uncertainty as a .npy file in metres; ConfigError if there is none."""
+        return _npy(self._uncertainty())
+
+    def _uncertainty(self) -> Float[np.ndarray, "h w"]:
+        if self.uncertainty_m is None:
+            raise ConfigError("uncertainty needs the mirrored image's prediction, too. Pass flip=true.")
+        return self.uncertainty_m
+
+
+def _npy(metres: Float[np.ndarray, "h w"]) -> bytes:
+    """Return a .npy file. NumPy, writing one itself, does not say why it cannot."""
+    memory = io.BytesIO()
+    np.save(memory, metres)
+    return memory.getvalue()
 
 
 def jpeg(rgb: UInt8[np.ndarray, "h w 3"], *, quality: int = 92) -> bytes:

@@ -10,25 +10,20 @@ from typing import Annotated, Any, NamedTuple, overload
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from numpy.typing import NDArray
-from PIL import Image
 from torch import nn
 
 from hudepth.base.camera import CameraChoice, CameraLike, CameraOption, Intrinsics
 from hudepth.base.errors import CheckpointError, ConfigError
-from hudepth.base.images import Photo, as_rgb, pillow_rgb, read_photo
+from hudepth.base.images import Photo
 from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Range, Size, parse
 from hudepth.inference.backends import EXPORTED, Backend, BackendName, Precision, TorchBackend, open_exported
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.image_fit import Fit, Fitted, camera_factor, fit_image, unfit_depth
 from hudepth.inference.model_info import ModelInfo
+from hudepth.inference.pictures import Picture, read_picture
 from hudepth.inference.runtimes import OPENVINO_PRECISIONS
 from hudepth.runs.checkpoint import load_checkpoint
-
-Picture = Photo | str | Path | bytes | NDArray[Any] | torch.Tensor | Image.Image
-"""An image: one that was read, a path, the bytes of a file, an array (grey, RGB or RGBA of 8 or 16 bits), a tensor of
-such numbers, with the channels first or last, or a Pillow image."""
 
 
 class Prepared(NamedTuple):
@@ -39,6 +34,14 @@ class Prepared(NamedTuple):
     camera: Intrinsics
     factor: float
     """By which depth is multiplied for this camera; 1 if it is only assumed."""
+
+
+class Predicted(NamedTuple):
+    """A prediction at the network's size [m]."""
+
+    depth_m: Float[np.ndarray, "h w"]
+    uncertainty_m: Float[np.ndarray, "h w"] | None = None
+    """With ``flip``: half the difference from the prediction of the mirrored image."""
 
 
 class DepthModel:
@@ -85,23 +88,12 @@ class DepthModel:
     def predict_many(self, images: Iterable[Picture], *, batch_size: int = 1) -> list[DepthMap]:
         """Predict the depth of several images, ``batch_size`` at a time; raises DataError if one cannot be read."""
         prepared = [self.prepare(image) for image in images]
-        depths = [d for at in range(0, len(prepared), batch_size) for d in self.run(prepared[at : at + batch_size])]
-        return [self.finish(each, depth) for each, depth in zip(prepared, depths, strict=True)]
+        found = [p for at in range(0, len(prepared), batch_size) for p in self.run(prepared[at : at + batch_size])]
+        return [self.finish(each, predicted) for each, predicted in zip(prepared, found, strict=True)]
 
     def prepare(self, image: Picture, *, camera: CameraLike | None = None) -> Prepared:
         """Decode an image and resize it to the network's input; see :meth:`predict`."""
-        if isinstance(image, torch.Tensor):
-            image = _pixels(image)
-        if isinstance(image, Photo):
-            photo = image
-        elif isinstance(image, Image.Image):
-            photo = Photo(pillow_rgb(image), ())
-        elif isinstance(image, np.ndarray):
-            photo = Photo(as_rgb(image), ())
-        elif isinstance(image, str | Path | bytes):
-            photo = read_photo(image)
-        else:
-            raise TypeError(f"image: {type(image).__name__}. Pass a path, bytes, array, tensor or Pillow image.")
+        photo = read_picture(image)
         fitted = fit_image(photo.rgb, self.info.size, fit=self.fit, aspect=self.info.aspect)
         size = (photo.rgb.shape[0], photo.rgb.shape[1])
         choice = self.camera if camera is None else CameraChoice.of(camera)
@@ -113,15 +105,15 @@ class DepthModel:
             assumed = replace(assumed, origin=f"{assumed.origin}, since {photo.camera}")
         return Prepared(photo, fitted, assumed, 1.0)
 
-    def run(self, batch: Sequence[Prepared]) -> Float[np.ndarray, "b h w"]:
-        """Return depth [m] at the network's size; raises CheckpointError if it is not finite, or negative."""
+    def run(self, batch: Sequence[Prepared]) -> list[Predicted]:
+        """Predict at the network's size; raises CheckpointError if depth is not finite, or negative."""
         images = np.stack([each.fitted.rgb for each in batch])
         depth = self._depth(images)
         if not self.flip:
-            return depth
+            return [Predicted(each) for each in depth]
         mirrored = self._depth(np.ascontiguousarray(images[:, :, ::-1]))[:, :, ::-1]
         mean: Float[np.ndarray, "b h w"] = (depth + mirrored) / np.float32(2)
-        return mean
+        return [Predicted(*each) for each in zip(mean, np.abs(depth - mean), strict=True)]
 
     def _depth(self, images: UInt8[np.ndarray, "b h w 3"]) -> Float[np.ndarray, "b h w"]:
         depth = self.backend(images)
@@ -130,26 +122,18 @@ class DepthModel:
             raise CheckpointError(f"checkpoint: {self.info.name}: {why}")
         return depth
 
-    def finish(self, prepared: Prepared, depth_m: Float[np.ndarray, "h w"]) -> DepthMap:
-        """Resize the network's depth to the image's size."""
+    def finish(self, prepared: Prepared, predicted: Predicted) -> DepthMap:
+        """Resize the network's depth to the image's size, in the metres of its camera."""
         rgb = prepared.photo.rgb
-        metres = unfit_depth(depth_m, prepared.fitted.box, (rgb.shape[0], rgb.shape[1]))
-        if prepared.factor != 1:
-            metres = metres * np.float32(prepared.factor)
+
+        def at_size(map_m: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "H W"]:
+            metres = unfit_depth(map_m, prepared.fitted.box, (rgb.shape[0], rgb.shape[1]))
+            return metres if prepared.factor == 1 else metres * np.float32(prepared.factor)
+
+        metres = at_size(predicted.depth_m)
+        uncertainty = None if predicted.uncertainty_m is None else at_size(predicted.uncertainty_m)
         limit = self.info.farthest_m * prepared.factor
-        return DepthMap(metres, rgb, limit, prepared.photo.notes, prepared.camera, prepared.factor)
-
-
-def _pixels(image: torch.Tensor) -> NDArray[Any]:
-    """Return a tensor as an array with the channels last; TypeError if it does not hold the numbers of a picture."""
-    if image.dtype not in (torch.uint8, torch.uint16) or image.layout != torch.strided or image.is_meta:
-        raise TypeError(
-            f"image: a tensor of {str(image.dtype).removeprefix('torch.')}. Pass uint8 or uint16 of shape "
-            "[height,width,3] or [3,height,width]; floats from 0 to 1 are (255 * x).round().to(torch.uint8)."
-        )
-    array: NDArray[Any] = image.cpu().numpy()
-    first = array.ndim == 3 and array.shape[0] in (1, 3, 4) and array.shape[2] not in (1, 3, 4)
-    return np.moveaxis(array, 0, 2) if first else array
+        return DepthMap(metres, rgb, limit, prepared.photo.notes, prepared.camera, prepared.factor, uncertainty)
 
 
 @dataclass(frozen=True, kw_only=True)

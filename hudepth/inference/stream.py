@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.inference.depth_map import DepthMap
-from hudepth.inference.model import DepthModel, Picture, Prepared
+from hudepth.inference.model import DepthModel, Predicted, Prepared
+from hudepth.inference.pictures import Picture
 
 Key = TypeVar("Key")
 LOT, MOST = 8, 64  # images that are decoded, predicted and written together, per thread and in all: memory holds three
@@ -109,20 +110,21 @@ class Stream(Generic[Key]):
                 good.append((key, prepared))
         for at in range(0, len(good), self.batch_size):
             batch = good[at : at + self.batch_size]
-            depths = self.model.run([prepared for _, prepared in batch])
-            for (key, prepared), depth in zip(batch, depths, strict=True):
+            found = self.model.run([prepared for _, prepared in batch])
+            for (key, prepared), predicted in zip(batch, found, strict=True):
                 if prepared.photo.notes:
                     self.tally.notes[str(key)] = "; ".join(prepared.photo.notes)
-                yield key, partial(self._finish, key, prepared, self._smooth(depth))
+                yield key, partial(self._finish, key, prepared, self._smooth(predicted))
 
-    def _smooth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    def _smooth(self, predicted: Predicted) -> Predicted:
+        depth = predicted.depth_m
         if self.smoothing and self._previous is not None:
             depth = (self.smoothing * self._previous + (1 - self.smoothing) * depth).astype(np.float32)
         self._previous = depth
-        return depth
+        return predicted._replace(depth_m=depth)
 
-    def _finish(self, key: Key, prepared: Prepared, depth: Float[np.ndarray, "h w"]) -> None:
-        self.write(key, self.model.finish(prepared, depth))
+    def _finish(self, key: Key, prepared: Prepared, predicted: Predicted) -> None:
+        self.write(key, self.model.finish(prepared, predicted))
 
     def _count(self, writing: list[Future[None]]) -> None:
         """Wait for what is being written, and count it; raise the first error."""

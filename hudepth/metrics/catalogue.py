@@ -107,6 +107,8 @@ for _info in (
     MetricInfo("si_boundary_f1", "Bochkovskii et al. 2024 (Depth Pro)", higher_is_better=True, shown="edge"),
     MetricInfo("dbe_acc_px", _DBE, unit="px", shown="edges"),
     MetricInfo("dbe_comp_px", _DBE, unit="px", shown="edges"),
+    MetricInfo("flip_ause", "Ilg et al. 2018, of the relative error"),
+    MetricInfo("flip_rank_corr", "Spearman, with the relative error", higher_is_better=True),
 ):
     register(_info)
 

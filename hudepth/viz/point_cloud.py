@@ -104,11 +104,12 @@ def point_cloud(
     intrinsics: Intrinsics | None = None,
     *,
     edges: bool = True,
+    kept: Bool[np.ndarray, "h w"] | None = None,
 ) -> PointCloud:
     """Lift each pixel to a point, coloured by the RGB image; pixels of depth 0 are left out.
 
     ``depth_m`` is measured along the optical axis; the intrinsics, in its pixels, are by default those of NYU, scaled.
-    ``edges`` false also leaves out :func:`depth_edges`.
+    ``edges`` false also leaves out :func:`depth_edges`, and ``kept`` the pixels where it is false.
     """
     height, width = depth_m.shape
     camera = intrinsics or Intrinsics.of_photo(height, width)
@@ -118,6 +119,8 @@ def point_cloud(
     points = np.asarray(points, np.float32)
     colours = None if image is None else image.reshape(-1, 3)
     seen = (depth_m > 0).reshape(-1)
+    if kept is not None:
+        seen &= kept.reshape(-1)
     if not edges:
         seen &= ~depth_edges(depth_m, camera).reshape(-1)
     if not seen.all():

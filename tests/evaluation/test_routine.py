@@ -23,6 +23,7 @@ from hudepth.metrics.boundary import BOUNDARY_NAMES, boundary_metrics
 from hudepth.metrics.protocol import Protocol
 from hudepth.metrics.strata import STRATA
 from hudepth.metrics.summary import ImageTable, summarise
+from hudepth.metrics.uncertainty import uncertainty_metrics
 from hudepth.models import TinyUNet
 
 PAPER = Protocol(name="paper", ssim_window=3)
@@ -187,6 +188,36 @@ def test_protocols_scored_together_or_alone_are_the_same(cache: Path, net: TinyU
         )  # fmt: skip
     rows = [together.sums["model", protocol.name].nan_to_num() for protocol in protocols]
     assert all(not torch.equal(a, b) for i, a in enumerate(rows) for b in rows[:i])
+
+
+def test_a_flip_also_measures_what_its_disagreement_tells(cache: Path, net: TinyUNet) -> None:
+    data = make_data(cache)
+    flip = dataclasses.replace(PAPER, name="flip", flip=True)
+    evaluation = Evaluation({"model": net, "other": net}, [PAPER, flip], max_depth_m=10.0, detailed="model")
+    Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_model_summary=False,
+        enable_progress_bar=False, use_distributed_sampler=False,
+    ).test(evaluation, datamodule=data, verbose=False)  # fmt: skip
+    assert set(evaluation.uncertainty) == {"flip"}
+    rows = []
+    for batch in data.test_dataloader():
+        ready = data.on_after_batch_transfer(batch, 0)
+        with torch.no_grad():
+            both = [10 * net(ready["image"]), 10 * net(ready["image"].flip(-1)).flip(-1)]
+        rows.append(
+            uncertainty_metrics(
+                sum(both) / 2,
+                10 * ready["unit_depth"],
+                ready["valid"],
+                (both[0] - both[1]).abs(),  # type: ignore[arg-type]
+            )
+        )
+    torch.testing.assert_close(evaluation.uncertainty["flip"], torch.cat(rows), rtol=1e-3, atol=1e-4)
+    table = image_table(
+        flip, evaluation.sums["model", "flip"], [data.store.records[i] for i in evaluation.indices],
+        uncertainty=evaluation.uncertainty["flip"],
+    )  # fmt: skip
+    assert {"flip_ause", "flip_rank_corr"} <= set(summarise(table, averaging="pooled"))
 
 
 def test_edges_and_strata_are_measured_where_asked_for(cache: Path, net: TinyUNet) -> None:

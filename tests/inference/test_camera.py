@@ -163,3 +163,23 @@ def test_a_field_of_view_is_typed_as_it_is_said(tiny: Path, tmp_path: Path, comm
         assert "camera: as given" in done.err
         settings = json.loads(Path("out/predictions.json").read_text())["settings"]
         assert settings["camera"] == (written or [50, 50, 32, 24])
+
+
+def test_uncertain_points_are_left_out(tiny: Path, tmp_path: Path, command: Command) -> None:
+    (tmp_path / "a.jpg").write_bytes(photograph(26, size=(48, 32)))  # of the size of the network
+    options = ("formats=[npy,uncertainty,ply]", "flip=true", "edges=true", "output=out")
+    assert command("predict", f"checkpoint={tiny}", "input=a.jpg", *options, "max_uncertainty=0.1").code == 0
+    depth, unsure = np.load("out/a_depth.npy"), np.load("out/a_uncertainty.npy")
+    both = [
+        hudepth.load(tiny).predict(np.ascontiguousarray(image)) for image in (depth_image(), depth_image()[:, ::-1])
+    ]
+    scaled = [each.metres * hudepth.load(tiny).predict("a.jpg").camera_factor for each in both]
+    np.testing.assert_allclose(unsure, np.abs(scaled[0] - scaled[1][:, ::-1]) / 2, atol=2e-3)
+    sure = int((unsure <= np.float32(0.1) * depth).sum())
+    assert 0 < sure < depth.size
+    assert f"element vertex {sure}\n".encode() in Path("out/a_depth.ply").read_bytes()
+
+
+def depth_image() -> np.ndarray:
+    with Image.open("a.jpg") as image:
+        return np.asarray(image.convert("RGB"))

@@ -66,7 +66,7 @@ def test_a_folder_by_the_installed_script(trained: Path, photos: Path, tmp_path:
         assert (out / f"{stem}_depth.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
         assert (out / f"{stem}_side.jpg").exists()
     stated = json.loads((out / "predictions.json").read_text())
-    assert stated["units"] == {"png16": "mm", "npy": "m", "ply": "m"}
+    assert stated["units"] == {"png16": "mm", "npy": "m", "uncertainty": "m", "ply": "m", "glb": "m"}
     assert stated["network_size"] == [32, 48]
     assert stated["model"]["source"] == "rooms"
     assert (stated["predicted"], stated["failed"], stated["fit"]) == (3, {}, "stretch")
@@ -196,6 +196,8 @@ def test_letterbox_and_size_and_scale(tiny: Path, photos: Path, command: Command
         (("input=nowhere",), "input: .*'nowhere'.* video"),
         (("formats=[png]",), "formats: .* 'png16'"),
         (("formats=[]",), r"formats: \[\] .* png16, npy"),
+        (("formats=[npy,uncertainty]",), "formats: uncertainty needs .* flip=true"),
+        (("max_uncertainty=0.1",), "max_uncertainty needs .* flip=true"),
         (("smoothing=1",), "smoothing: 1 .* below 1"),
         (("scale_m=[4,1]",), r"scale_m: \[4,1\] .* rising"),
         (("camera=[1,2,3]",), r"camera: \[1,2,3\] .*fx,fy,cx,cy"),

@@ -60,7 +60,7 @@ def test_every_format_says_why_it_cannot_be_written(name: str, tmp_path: Path) -
 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     metres = np.random.default_rng(0).random((48, 64), np.float32)
-    depth = DepthMap(metres, np.zeros((48, 64, 3), np.uint8), 10.0)
+    depth = DepthMap(metres, np.zeros((48, 64, 3), np.uint8), 10.0, uncertainty_m=metres)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))  # the first bytes can be written
         with pytest.raises(OSError, match="too large") as caught:

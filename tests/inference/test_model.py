@@ -40,6 +40,10 @@ def test_flipping_averages_with_the_mirrored_image_mirrored_back(grey: DepthMode
     for image, before, after in zip(images, plain, flipped, strict=True):
         np.testing.assert_allclose(before.metres, image.mean(-1) + 0.1 * np.arange(width), rtol=1e-5)
         np.testing.assert_allclose(after.metres, image.mean(-1) + 0.1 * (width - 1) / 2, rtol=1e-5)
+        difference = 0.1 * np.abs(2 * np.arange(width) - (width - 1))  # of both predictions
+        assert before.uncertainty_m is None
+        assert after.uncertainty_m is not None
+        np.testing.assert_allclose(after.uncertainty_m, np.tile(difference / 2, (len(image), 1)), atol=1e-4)
 
 
 def test_the_bundled_pretrained_model_sees_depth() -> None:
