@@ -73,7 +73,7 @@ def _about(info: ModelInfo) -> str:
     calibrated = f" It is {info.calibration} (in metres, as the network predicts it)." if info.calibration else ""
     return (
         f"Depth in metres from a single RGB image: {info.name}, {info.parameters:,} parameters, input {height} x "
-        f"{width} (height x width), depths up to {info.max_depth_m:g} m. Made with hudepth, which implements "
+        f"{width} (height x width), depths up to {info.farthest_m:.4g} m. Made with hudepth, which implements "
         f"Turkmen & Akgun (2025).{calibrated}"
     )
 
@@ -156,7 +156,7 @@ def _limits(info: ModelInfo, source: str) -> str:
         "## Limits\n\n"
         f"- Trained on scenes like those of `{source}`. Elsewhere (outdoors, other cameras, other heights) its metres "
         "are guesses: a single image does not determine scale.\n"
-        f"- It predicts nothing beyond {info.max_depth_m:g} m.\n"
+        f"- It predicts nothing beyond {info.farthest_m:.4g} m.\n"
         "- Images are resized to the input size as in training; another field of view shifts all distances, unless\n"
         "  `camera=` of `hudepth-predict` or the file's EXIF states it.\n"
         "- Errors are largest at mirrors, glass, thin objects and edges. Do not steer or brake by it."

@@ -55,7 +55,8 @@ def measure_int8(
     HudepthError, also if a class in ``protocols`` is neither hudepth's nor under ``trust``.
     """
     built = build_protocols(protocols, datamodule=datamodule, trust=trust)
-    predictors: dict[str, nn.Module] = {FLOAT: reference.pipeline.net, INT8: _BackendNet(quantised)}
+    plain = reference.pipeline.net if reference.info.calibration is None else _BackendNet(reference)
+    predictors: dict[str, nn.Module] = {FLOAT: plain, INT8: _BackendNet(quantised)}
     evaluation = Evaluation(predictors, built, max_depth_m=datamodule.max_depth_m)
     run_evaluation(evaluation, datamodule, {"accelerator": "cpu"})
     note_scored(checkpoint, datamodule, built)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import hudepth
 from hudepth.base.camera import NYU_FOCAL, Intrinsics
 from hudepth.base.errors import ConfigError
 from hudepth.data.rooms.raycast import BOX, ROOM_FACES, Solids, View, trace
+from hudepth.export.graphs import describe
 from hudepth.inference.depth_map import DepthMap
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
@@ -104,6 +106,15 @@ def test_a_training_camera_of_its_own() -> None:
     assert same.numbers == pytest.approx((60, 60, 29.5, 23.5))
     read = ModelInfo.from_json(own.info.to_json(), where="x")
     assert read.training_focal == (1.0, 1.25)
+
+
+def test_an_exported_file_states_the_factor_for_other_programs() -> None:
+    words = describe(NYU.info)["camera"]
+    formula = re.sub(r"\) \(", ") * (", words.partition("multiply depth by ")[2].replace("^", "**"))
+    found = eval(formula, {"fx": 60, "fy": 61, "width": 64, "height": 48})
+    given = DepthModel(NYU, camera=(60.0, 61.0, 32.0, 24.0)).predict(np.zeros((48, 64, 3), np.uint8))
+    assert found == pytest.approx(given.camera_factor, rel=1e-3)
+    assert "camera" not in describe(Grey(trained_on={"source": "folder"}).info)
 
 
 def test_a_description_without_a_camera_is_still_read() -> None:
