@@ -75,7 +75,7 @@ def _describe_camera(info: ModelInfo) -> dict[str, str]:
     if info.training_focal is None:
         return {}
     (across, down), (x, y) = info.training_focal, FOCAL_POWERS
-    ratios = f"(fx / width / {across:.4f})^{x:g} (fy / height / {down:.4f})^{y:g}"
+    ratios = f"(fx / width / {across:.4f})^{x:g} * (fy / height / {down:.4f})^{y:g}"
     return {"camera": f"for pictures of focal lengths fx, fy [pixels], multiply depth by {ratios}"}
 
 
