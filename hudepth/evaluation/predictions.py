@@ -58,6 +58,8 @@ class FilePredictions(nn.Module):
 
     def __init__(self, options: PredictionOptions, datamodule: DepthDataModule) -> None:
         super().__init__()
+        if options.per_m is not None and options.kind != "metric":
+            raise ConfigError(f"per_m: kind={options.kind} has no unit. Leave per_m out, or pass kind=metric.")
         self.options, self._store, self._size = options, datamodule.store, datamodule.size
         test = datamodule.split.test
         files = _find(options.predictions, [self._store.records[row] for row in test], self._store.records)
@@ -133,8 +135,8 @@ class FilePredictions(nn.Module):
             f"or pass data.size=[{found[0]},{found[1]}] if it shows the whole image."
         )
 
-    def _sample(self, row: int) -> tuple[float, float, float]:
-        """Return the median prediction, the median truth and the correlation of both."""
+    def _sample(self, row: int) -> tuple[float, float, float, float]:
+        """Return the medians of prediction and truth, their correlation, and the share of predictions of 0 and less."""
         if self._store.has_native:
             truth = self._store.read_native(row)
         else:
@@ -143,14 +145,15 @@ class FilePredictions(nn.Module):
         pred = cv2.resize(self._read(row, size), truth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         p, t = pred[truth > 0], truth[truth > 0]
         if not p.size:
-            return 0.0, 0.0, 0.0
+            return 0.0, 0.0, 0.0, 0.0
         covariance, spread = float(((p - p.mean()) * (t - t.mean())).mean()), float(p.std() * t.std())
-        return float(np.median(p)), float(np.median(t)), covariance / (spread or 1.0)
+        return float(np.median(p)), float(np.median(t)), covariance / (spread or 1.0), float(np.mean(p <= 0))
 
-    def _check(self, sampled: Sequence[tuple[float, float, float]]) -> None:
+    def _check(self, sampled: Sequence[tuple[float, float, float, float]]) -> None:
         """Refuse or warn of predictions that are probably in another unit, or the inverse of what was stated."""
         kind, key = self.options.kind, f"predictions: kind={self.options.kind}"
-        pred, truth, correlation = np.median(np.array([each for each in sampled if each[1] > 0] or [(1, 1, 0)]), axis=0)
+        measured = np.array([each for each in sampled if each[1] > 0] or [(1.0, 1.0, 0.0, 0.0)])
+        pred, truth, correlation, _ = np.median(measured, axis=0)
         if kind == "metric":
             ratio = float(pred / truth)
             text = f"{key}: they have a median of {pred:.3g} m where the truth has {truth:.3g} m. "
@@ -159,6 +162,8 @@ class FilePredictions(nn.Module):
                 raise DataError(text)
             if not 1 / _OFF < ratio < _OFF:
                 log.warning("%s", text)
+            if (empty := float(measured[:, 3].mean())) > 0:
+                log.warning("%s: %.2g %% of them are 0 m or less, which counts as an error", key, 100 * empty)
         if (correlation if self.inverse else -correlation) > _TELLING:
             what, other = ("depth", "affine_depth or metric") if self.inverse else ("inverse depth", "affine_disparity")
             text = "%s: they look like %s (correlation with the truth %.2f). Pass kind=%s if so"

@@ -289,6 +289,7 @@ def eight_bits(folder: Path) -> None:
         (lambda p: os.truncate(p / "rgb_0.npy", 999), (), "not a complete .npy array"),
         (lambda p: None, ("kind=inverse",), "kind: 'inverse' is not one of metric, affine_depth, affine_disparity."),
         (lambda p: None, ("per_m=0",), "per_m: 0 is not a number above 0"),
+        (lambda p: None, ("kind=affine_depth", "per_m=2"), "per_m: kind=affine_depth has no unit. Leave per_m out"),
         (lambda p: None, ("protocol=eigen_flip",), "protocol=eigen_flip adds the prediction for the mirrored image"),
         (lambda p: None, ("kind=affine_disparity", "protocol.eigen.alignment=median"), "alignment=median does not fit"),
         (lambda p: None, ("checkpoint=last",), "checkpoint, predictions: both are set. Pass one of them."),
@@ -330,6 +331,8 @@ def test_likely_mistakes_are_warned_of(score: Callable[..., Result], tmp_path: P
     assert "1 of 4 files in 'p' are of no pair of the data, the first is 'other.npy'; left out" in done.err
     write(tmp_path / "p", PREDICTIONS)
     assert "look like depth (correlation with the truth 0." in score("kind=affine_disparity").err
+    write(tmp_path / "p", [np.where(np.indices(SIZE)[1] < 64, 0, depth) for depth in PREDICTIONS])
+    assert "kind=metric: 10 % of them are 0 m or less, which counts as an error" in score().err
     for i, depth in enumerate(PREDICTIONS):
         (tmp_path / "p" / f"rgb_{i}.npy").unlink()
         cv2.imwrite(str(tmp_path / "p" / f"rgb_{i}_depth.png"), np.rint(depth * 256).astype(np.uint16))
