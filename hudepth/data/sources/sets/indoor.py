@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
 from typing import Annotated, ClassVar
 
+from hudepth.base.errors import DataError
+from hudepth.base.images import check_file
 from hudepth.base.options import Choice, Range
 from hudepth.data.encoding import Encoding
 from hudepth.data.sources.base import RawPair, Record
@@ -20,8 +23,8 @@ class SunRgbdSource(SetSource):
     """SUN RGB-D as in ``SUNRGBD.zip``: 10,335 pairs of four sensors (Song, Lichtenberg and Xiao, CVPR 2015).
 
     ``kv1/NYUdata/NYU0001/image/NYU0001.jpg`` with a PNG in ``depth`` (as measured) or ``depth_bfx`` (holes filled).
-    Lists hold the folders of pairs, with or without what comes before the sensor's name. Only the videos of
-    ``sun3ddata`` have scenes.
+    Lists hold the folders of pairs, with or without what comes before the sensor's name, or are ``allsplit.mat`` of the
+    set's toolbox, 5,285 and 5,050 pairs. Only the videos of ``sun3ddata`` have scenes.
     """
 
     name: ClassVar[str] = "sunrgbd"
@@ -46,6 +49,21 @@ class SunRgbdSource(SetSource):
     def expects(self) -> str:  # type: ignore[override]
         """What the root holds."""
         return f"kv1/.../image/*.jpg and {self.depth}/*.png"
+
+    def lines(self, root: Path, name: str | None, *, split: str) -> Iterator[tuple[int, str]]:
+        """Yield the lines of a list, or the folders of a split of ``allsplit.mat``."""
+        if name is None or not name.endswith(".mat"):
+            return super().lines(root, name, split=split)
+        from scipy.io import loadmat
+        from scipy.io.matlab import MatReadError
+
+        path, key = root / Path(name).expanduser(), f"data.source.{split}_list"
+        check_file(path)
+        try:
+            cells = loadmat(path, variable_names=[f"all{split}"])[f"all{split}"].ravel()
+            return enumerate((str(cell.item()) for cell in cells), 1)
+        except (OSError, ValueError, KeyError, AttributeError, NotImplementedError, TypeError, MatReadError):
+            raise DataError(f"{key}: '{path}' is not the allsplit.mat of SUN RGB-D's toolbox.") from None
 
     def entry(self, line: str) -> str | None:
         """Return a folder from the sensor's name on."""

@@ -31,6 +31,10 @@ class KittiSource(SetSource):
     name: ClassVar[str] = "kitti"
     homepage: ClassVar[str] = "https://www.cvlibs.net/datasets/kitti/"
     licence: ClassVar[str] = "cc-by-nc-sa-3.0"
+    terms: ClassVar[str] = (
+        "KITTI (Geiger, Lenz, Stiller, Urtasun, IJRR 2013) with annotated depth (Uhrig et al., 3DV 2017), published "
+        "under CC BY-NC-SA 3.0: not for commercial use."
+    )
     indoor = False
     sparse = True
     usual_median_m = (5.0, 35.0)

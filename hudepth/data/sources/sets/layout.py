@@ -68,6 +68,10 @@ class SetSource(FileSource):
         """Return the root."""
         return existing_root(self.root, expects=f"folder with {self.expects}")
 
+    def lines(self, root: Path, name: str | None, *, split: str) -> Iterator[tuple[int, str]]:
+        """Yield number and text of each line of a list; see :func:`read_list`."""
+        return read_list(root, name, key=f"data.source.{split}_list")
+
     def entry(self, line: str) -> str | None:
         """Return the id or scene that a line of a list names; None if it names none."""
         return line
@@ -117,7 +121,7 @@ class SetSource(FileSource):
         """Return the split of each entry of the lists."""
         found: dict[str, str] = {}
         for split, name in (("train", self.train_list), ("test", self.test_list)):
-            for number, line in read_list(root, name, key=f"data.source.{split}_list"):
+            for number, line in self.lines(root, name, split=split):
                 entry = self.entry(line)
                 if entry is None:
                     why = f"line {number} of '{name}' names no pair of {self.name}"

@@ -31,6 +31,7 @@ class DiodeSource(SetSource):
     name: ClassVar[str] = "diode"
     homepage: ClassVar[str] = "https://diode-dataset.org/"
     licence: ClassVar[str] = "mit"
+    terms: ClassVar[str] = "DIODE (Vasiljevic et al., arXiv:1908.00463), published under the MIT licence."
     key: ClassVar[str] = r"\g<pair>"
     scene: ClassVar[str] = r"\g<place>"
 
@@ -81,6 +82,7 @@ class Eth3dSource(SetSource):
     name: ClassVar[str] = "eth3d"
     homepage: ClassVar[str] = "https://www.eth3d.net/"
     licence: ClassVar[str] = "cc-by-nc-sa-4.0"
+    terms: ClassVar[str] = "ETH3D (Schöps et al., CVPR 2017), published under CC BY-NC-SA 4.0: not for commercial use."
     indoor = False
     usual_median_m = (0.5, 60.0)
     key: ClassVar[str] = r"\g<place>/\g<name>"

@@ -30,6 +30,9 @@ class TumSource(FileSource):
     name: ClassVar[str] = "tum"
     homepage: ClassVar[str] = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
     licence: ClassVar[str] = "cc-by-4.0"
+    terms: ClassVar[str] = (
+        "TUM RGB-D (Sturm, Engelhard, Endres, Burgard, Cremers, IROS 2012), published under CC BY 4.0."
+    )
     usual_median_m = (0.4, 6.0)
 
     root: str | Path | None

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.prepare import prepare
@@ -182,6 +183,27 @@ def test_sunrgbd_lists_and_scenes(tmp_path: Path) -> None:
     assert [Path(record.depth).parent.name for record in records] == ["depth"] * 3
     with pytest.raises(ConfigError, match=r"data\.source\.depth: 'raw' is not one of depth, depth_bfx"):
         SunRgbdSource(tmp_path, depth="raw")
+
+
+def test_sunrgbd_reads_its_toolboxs_split(tmp_path: Path) -> None:
+    TREES["sunrgbd"].write(tmp_path)
+    cells = {}
+    for split, pairs in (("train", ["kv1/NYUdata/NYU0001", "kv2/kinect2data/000002_a"]), ("test", ["kv1/none"])):
+        cells[f"all{split}"] = np.empty((1, len(pairs)), object)
+        cells[f"all{split}"][0] = [f"/n/fs/sun3d/data/SUNRGBD/{pair}" for pair in pairs]
+    savemat(tmp_path / "allsplit.mat", cells)
+    source = SunRgbdSource(tmp_path, train_list="allsplit.mat", test_list="allsplit.mat")
+    assert [(record.id, record.split) for record in source.records()] == [
+        ("kv1/NYUdata/NYU0001", "train"), ("kv2/kinect2data/000002_a", "train"),
+    ]  # fmt: skip
+    savemat(tmp_path / "other.mat", {"alltest": np.arange(3.0)})
+    (tmp_path / "text.mat").write_text("kv1/NYUdata/NYU0001")
+    with pytest.raises(DataError, match=r"data\.source\.train_list: '.*other\.mat' is not the allsplit\.mat"):
+        SunRgbdSource(tmp_path, train_list="other.mat").records()
+    with pytest.raises(DataError, match=r"data\.source\.test_list: '.*text\.mat' is not the allsplit\.mat"):
+        SunRgbdSource(tmp_path, test_list="text.mat").records()
+    with pytest.raises(DataError, match="no file '"):
+        SunRgbdSource(tmp_path, test_list="none.mat").records()
 
 
 def test_diode_outdoors_reaches_far(tmp_path: Path) -> None:
