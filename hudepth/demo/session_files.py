@@ -89,7 +89,7 @@ class Files:
         folder.mkdir()
         with self._lock:
             self._sessions.setdefault(session, _Session()).results = folder
-        style = Style(scale_m=(0.0, answer.depth.max_depth_m))
+        style = Style(scale_m=(0.0, answer.depth.max_depth_m), edges=True)  # as the page shows them
         paths = []
         for name in DOWNLOADS:
             ending, write = FORMATS[name]
