@@ -13,6 +13,7 @@ import pytest
 from hudepth.report.ablation.page import page
 from hudepth.report.ablation.pictures import Picture
 from hudepth.report.ablation.report import Report
+from tests.browser import chromium
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
