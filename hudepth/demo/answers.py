@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,8 @@ from hudepth.base.images import read_photo, resize_image
 from hudepth.data.store import to_mm
 from hudepth.inference.depth_map import DepthMap, jpeg
 from hudepth.inference.model import DepthModel
-from hudepth.viz.colour import colour_depth
+from hudepth.viz.colour import auto_scale, colour_depth
+from hudepth.viz.point_cloud import depth_edges
 
 MAX_SIDE = 640  # of the map that goes to the browser [pixels]: more than the networks resolve, and less than a megabyte
 
@@ -39,18 +41,19 @@ class Answer:
     payload: dict[str, Any]  # input of the page's script
 
 
-def answer(path: Path, model: DepthModel, limits: Limits) -> Answer:
+def answer(path: Path, model: DepthModel, limits: Limits, camera: str | None = None) -> Answer:
     """Predict the depth of an uploaded picture; raises DataError with one line for the visitor.
 
-    Where the model's camera cannot have taken it, that of the training images stands in, and the caption says so.
+    ``camera`` is the visitor's choice, as :func:`hudepth.load` takes it; None is the model's. Where that cannot have
+    taken the picture, the camera of the training images stands in, and the facts say so.
     """
     start = time.perf_counter()
     data = _read_upload(path, limits.upload_bytes)
     photo = read_photo(data, where=f"'{path.name}'", max_pixels=limits.pixels)
     try:
-        depth = model.predict(photo)
+        depth = model.predict(photo, camera=camera)
     except ConfigError:
-        note = "camera= is not of a picture of this size"
+        note = "the camera that was set cannot have taken a picture of this size"
         depth = model.predict(photo._replace(notes=(*photo.notes, note)), camera="training")
     shown = reduce_depth(depth)
     rows, columns = shown.metres.shape
@@ -59,10 +62,12 @@ def answer(path: Path, model: DepthModel, limits: Limits) -> Answer:
         "width": columns,
         "height": rows,
         "depth_mm": base64.b64encode(to_mm(shown.metres).astype("<u2").tobytes()).decode(),
+        "edges": base64.b64encode(np.packbits(depth_edges(shown.metres, shown.camera)).tobytes()).decode(),
         "photo": f"data:image/jpeg;base64,{base64.b64encode(jpeg(shown.image, quality=88)).decode()}",
-        "max_depth_m": depth.max_depth_m,
+        "max_depth_m": depth.max_depth_m / depth.camera_factor,  # of all pictures, whatever the camera
+        "scale_m": list(auto_scale(depth.metres)),
         "camera": list(shown.camera.numbers),
-        "caption": _caption(path.name, depth, seconds=time.perf_counter() - start),
+        "facts": _facts(path.name, depth, seconds=time.perf_counter() - start),
     }
     return Answer(path.stem[:80], depth, shown, payload)
 
@@ -99,10 +104,25 @@ def colour_table() -> UInt8[np.ndarray, "256 3"]:
     return np.asarray(colour_depth(steps, scale_m=(0.0, 255.0), legend=False)[0])
 
 
-def _caption(name: str, depth: DepthMap, *, seconds: float) -> str:
+def _facts(name: str, depth: DepthMap, *, seconds: float) -> list[str]:
+    """Return what there is to say of a picture, a line each."""
     height, width = depth.metres.shape
     near, middle, far = (float(np.quantile(depth.metres[::4, ::4], q)) for q in (0.01, 0.5, 0.99))
-    depths = f"{near:.2f} to {far:.2f} m, median {middle:.2f} m"
-    return "; ".join(
-        [f"{name}, {width} x {height}", depths, f"{seconds:.2f} s", f"camera: {depth.whose_camera}", *depth.notes]
-    )
+    return [
+        f"{name}, {width} x {height}",
+        f"{near:.2f} to {far:.2f} m away, median {middle:.2f} m",
+        _camera_words(depth),
+        *(note[:1].upper() + note[1:] for note in depth.notes),
+        f"Estimated in {seconds:.2f} s",
+    ]
+
+
+def _camera_words(depth: DepthMap) -> str:
+    """Return whose camera the metres are for, in words of people who have not read the options."""
+    words = depth.whose_camera
+    if depth.camera is not None and not depth.camera.known:
+        words = words.replace("'s, assumed", "'s camera assumed").replace("camera, assumed", "camera assumed")
+        return f"{words[0].upper()}{words[1:]}: set the field of view"
+    for key, unit in (("fov", " degrees across"), ("f35", " mm on 35 mm film"), ("f", " pixels of focal length")):
+        words = re.sub(rf"\b{key}=([\d.e+]+)", rf"\1{unit}", words)
+    return f"Camera {words}"

@@ -43,7 +43,7 @@ def demo(config: dict[str, Any]) -> None:
     model = load_model(options)
     model.predict(np.zeros((*model.info.size, 3), np.uint8))  # the first run is slow; visitors should not wait for it
     serve(
-        partial(answer, model=model, limits=limits),
+        lambda path, camera: answer(path, model, limits, camera),
         host=options.host, port=options.port, limits=limits, info=model.info, allowed_hosts=hosts,
         ready=partial(log.info, "model: %s; open %s (Ctrl-C stops)", model.info),
         camera=_camera_words(options.camera),
@@ -52,5 +52,5 @@ def demo(config: dict[str, Any]) -> None:
 
 def _camera_words(camera: str | tuple[float, ...]) -> str:
     if camera == "auto":
-        return "as each picture's EXIF states, else that of the training images"
-    return "that of the training images" if camera == "training" else f"as given, {camera}"
+        return "from the file, if it says"
+    return "the training camera's" if camera == "training" else f"as set: {camera}"

@@ -40,15 +40,15 @@ function pointsView(canvas) {
     gl.vertexAttribPointer(where, 3, type, type === gl.UNSIGNED_BYTE, 0, 0);
   }
 
-  // depth [mm] and rgba have width x height pixels; camera: fx, fy, cx, cy in those pixels.
-  function show({ width, height, depth, rgba, camera }) {
+  // depth [mm] and rgba have width x height pixels, edges a bit each; camera: fx, fy, cx, cy in those pixels.
+  function show({ width, height, depth, edges, rgba, camera }) {
     const [fx, fy, cx, cy] = camera;
     const points = new Float32Array(3 * width * height), colours = new Uint8Array(3 * width * height);
     count = 0;
     for (let v = 0, i = 0; v < height; v++) {
       for (let u = 0; u < width; u++, i++) {
         const z = depth[i] / 1000;
-        if (!z) continue;
+        if (!z || (edges[i >> 3] << (i & 7)) & 128) continue; // points of edges fly between two surfaces
         const at = 3 * count++;
         points[at] = ((u - cx) * z) / fx;
         points[at + 1] = ((v - cy) * z) / fy;

@@ -48,7 +48,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def serve(
-    compute: Callable[[Path], Answer],
+    compute: Callable[[Path, str | None], Answer],
     *,
     host: str,
     port: int,
@@ -61,12 +61,13 @@ def serve(
     """Serve the page until the process is interrupted or terminated; raises ConfigError if the port is taken.
 
     Args:
-        compute: predicts an uploaded file; raises HudepthError with one line for the page.
+        compute: predicts an uploaded file, for the camera that its visitor chose or None; raises HudepthError with one
+            line for the page.
         host: address to listen on.
         port: to listen on; 0 takes a free one.
         limits: the largest picture that is accepted.
         info: of the model.
-        camera: which is meant to have taken the pictures, in words.
+        camera: which is meant to have taken the pictures unless a visitor chooses another, in words.
         ready: called with the page's address once it responds.
         allowed_hosts: names by which requests may call this machine, besides ``localhost`` and its address.
     """

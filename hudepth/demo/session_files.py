@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hudepth.base.errors import DataError
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.demo.answers import Answer
 from hudepth.inference.depth_files import FORMATS, Style
@@ -19,7 +20,7 @@ from hudepth.inference.depth_map import jpeg
 
 EXAMPLE_ROOMS = (3, 1, 2, 0)  # scenes of the synthetic rooms: a living room, a kitchen, an office, a bedroom
 EXAMPLE_SIZE = (480, 640)
-DOWNLOADS = ("png16", "npy", "ply")  # formats that can be downloaded, in the order of the buttons
+DOWNLOADS = ("colour", "png16", "npy", "ply", "glb")  # formats that can be downloaded, in the order of the buttons
 _BLOCK = 4096  # bytes of a disk that the smallest file takes
 
 
@@ -80,22 +81,27 @@ class Files:
                     with contextlib.suppress(OSError):
                         entry.unlink(missing_ok=True)
 
-    def write(self, session: str, answer: Answer) -> list[Path]:
+    def write(self, session: str, answer: Answer) -> list[Path | None]:
         """Write a session's downloads, in the order of :data:`DOWNLOADS`, into a folder with an unguessable name.
 
-        PNG and npy have the size of the picture; the point cloud has the points that are shown. Raises OSError.
+        Colours, PNG and npy have the size of the picture; point clouds have the points that are shown, without those at
+        edges of depth. None stands for a format that cannot hold the picture. Raises OSError.
         """
         folder = self.results / secrets.token_urlsafe(16)
         folder.mkdir()
         with self._lock:
             self._sessions.setdefault(session, _Session()).results = folder
-        style = Style(scale_m=(0.0, answer.depth.max_depth_m), edges=True)  # as the page shows them
-        paths = []
+        paths: list[Path | None] = []
         for name in DOWNLOADS:
             ending, write = FORMATS[name]
-            paths.append(folder / f"{answer.name}{ending}")
-            with paths[-1].open("wb") as file:
-                write(answer.shown if name == "ply" else answer.depth, file, style)
+            path = folder / f"{answer.name}{ending}"
+            try:
+                with path.open("wb") as file:
+                    write(answer.shown if name in ("ply", "glb") else answer.depth, file, Style())
+                paths.append(path)
+            except DataError:
+                path.unlink()
+                paths.append(None)
         return paths
 
 

@@ -1,11 +1,11 @@
 // The viewer of one result. gr.HTML calls this with the element, its props and a way to watch them.
 const find = (selector) => element.querySelector(selector);
 const stage = find(".hd-stage"), cloud = find(".hd-cloud"), photo = find(".hd-photo"), slider = find(".hd-slider input");
-const reading = find(".hd-reading"), dot = find(".hd-dot"), own = find(".hd-own input");
-const HEIGHT_VH = 58; // maximum height of the picture, in percent of the window
+const reading = find(".hd-reading"), dot = find(".hd-dot"), fixed = find(".hd-fixed input");
+const HEIGHT_VH = 64; // maximum height of the picture, in percent of the window
 const bytesOf = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 const colours = bytesOf(props.colours); // 256 x RGB, near first
-let shown = null, mode = "map", points, at = null;
+let shown = null, mode = "map", points, at = null, marks = [];
 
 function show(value) {
   const result = value && value.depth_mm ? value : null;
@@ -22,9 +22,13 @@ function show(value) {
 }
 
 function showResult(result) {
-  shown = { ...result, depth: new Uint16Array(bytesOf(result.depth_mm).buffer) };
+  shown = { ...result, depth: new Uint16Array(bytesOf(result.depth_mm).buffer), edges: bytesOf(result.edges) };
   photo.src = result.photo;
-  find(".hd-caption").textContent = result.caption;
+  find(".hd-caption").replaceChildren(
+    ...result.facts.map((fact) => Object.assign(document.createElement("li"), { textContent: fact })),
+  );
+  find(".hd-fixed span").textContent = `same colours for all pictures, 0 to ${+result.max_depth_m.toFixed(1)} m`;
+  measure([]);
   stage.style.aspectRatio = cloud.style.aspectRatio = `${result.width} / ${result.height}`;
   find(".hd-viewer").style.setProperty("--hd-high", `${(HEIGHT_VH * result.width) / result.height}vh`);
   if (points) points.stale = true;
@@ -33,12 +37,7 @@ function showResult(result) {
 }
 
 // The ends of the colour scale [m].
-function scale() {
-  if (!own.checked) return [0, shown.max_depth_m];
-  const sorted = shown.depth.filter((mm) => mm > 0).sort();
-  const near = sorted[Math.floor(0.01 * sorted.length)] / 1000, far = sorted[Math.floor(0.99 * sorted.length)] / 1000;
-  return far - near > 0.1 ? [near, far] : [Math.max(0, near - 0.1), near + 0.1];
-}
+const scale = () => (fixed.checked ? [0, shown.max_depth_m] : shown.scale_m);
 
 function paint() {
   const { width, height, depth } = shown, [near, far] = scale();
@@ -85,10 +84,49 @@ function read(x, y) {
   reading.dataset.mm = mm;
   Object.assign(dot.style, { left: `${100 * at.x}%`, top: `${100 * at.y}%` });
   reading.hidden = dot.hidden = false;
+  place(reading, at.x, at.y);
+}
+
+// Lays a reading next to a point, inside the picture.
+function place(label, x, y) {
   const room = stage.getBoundingClientRect();
-  const left = at.x * room.width + 14, top = at.y * room.height - reading.offsetHeight - 10;
-  reading.style.left = `${left + reading.offsetWidth > room.width ? left - reading.offsetWidth - 28 : left}px`;
-  reading.style.top = `${top < 2 ? at.y * room.height + 14 : top}px`;
+  const left = x * room.width + 14, top = y * room.height - label.offsetHeight - 10;
+  label.style.left = `${left + label.offsetWidth > room.width ? Math.max(0, left - label.offsetWidth - 28) : left}px`;
+  label.style.top = `${top < 2 ? y * room.height + 14 : top}px`;
+}
+
+// The point in space [m] that lies at fractions of the picture's width and height; null without depth.
+function lift({ x, y }) {
+  const column = Math.floor(x * shown.width), row = Math.floor(y * shown.height), [fx, fy, cx, cy] = shown.camera;
+  const z = shown.depth[row * shown.width + column] / 1000;
+  return z ? [((column - cx) * z) / fx, ((row - cy) * z) / fy, z] : null;
+}
+
+// Marks at most two points, and states how far apart they are.
+function measure(next) {
+  marks = next;
+  const apart = find(".hd-apart"), span = find(".hd-span"), spots = element.querySelectorAll(".hd-mark");
+  spots.forEach((spot, i) => {
+    spot.hidden = !marks[i];
+    if (marks[i]) Object.assign(spot.style, { left: `${100 * marks[i].x}%`, top: `${100 * marks[i].y}%` });
+  });
+  const both = marks.length === 2;
+  apart.hidden = !both;
+  span.toggleAttribute("hidden", !both);
+  const hints = ["Click two points to measure how far apart they are.", "Click the other point."];
+  if (!both) return void (find(".hd-measure").textContent = hints[marks.length]);
+  const [a, b] = marks, [p, q] = marks.map(lift);
+  for (const line of span.children) {
+    for (const [name, value] of [["x1", a.x], ["y1", a.y], ["x2", b.x], ["y2", b.y]]) line.setAttribute(name, 100 * value);
+  }
+  const metres = Math.hypot(...p.map((value, i) => value - q[i])).toFixed(2);
+  apart.textContent = `${metres} m`;
+  place(apart, (a.x + b.x) / 2, (a.y + b.y) / 2);
+  find(".hd-measure").textContent = `The two points are ${metres} m apart. Click another to begin anew.`;
+}
+
+function mark() {
+  if (at && lift(at)) measure(marks.length === 2 ? [at] : [...marks, at]);
 }
 
 function hideReading() {
@@ -102,7 +140,7 @@ function setMode(next) {
   for (const button of element.querySelectorAll(".hd-modes button")) {
     button.setAttribute("aria-pressed", String(button.dataset.mode === mode));
   }
-  stage.hidden = find(".hd-slider").hidden = find(".hd-scale").hidden = find(".hd-own").hidden = inSpace;
+  for (const name of [".hd-stage", ".hd-slider", ".hd-scale", ".hd-fixed", ".hd-measure"]) find(name).hidden = inSpace;
   cloud.hidden = find(".hd-hint").hidden = !inSpace;
   if (inSpace && shown) showPoints();
 }
@@ -122,7 +160,7 @@ async function showPoints() {
   points.stale = false;
 }
 
-let dragging = false;
+let dragging = false, dragged = false;
 const shares = (event) => {
   const room = stage.getBoundingClientRect();
   return [(event.clientX - room.left) / room.width, (event.clientY - room.top) / room.height, room.width];
@@ -136,7 +174,7 @@ const nearLine = (event) => {
   return Math.abs(x - slider.value / 100) * width < (event.pointerType === "mouse" ? 8 : 22);
 };
 stage.addEventListener("pointerdown", (event) => {
-  dragging = nearLine(event);
+  dragging = dragged = nearLine(event);
   if (dragging) stage.setPointerCapture(event.pointerId);
   else read(...shares(event));
 });
@@ -147,7 +185,14 @@ stage.addEventListener("pointermove", (event) => {
 });
 for (const end of ["pointerup", "pointercancel"]) stage.addEventListener(end, () => (dragging = false));
 stage.addEventListener("pointerleave", (event) => event.pointerType === "mouse" && hideReading());
+stage.addEventListener("click", (event) => {
+  if (dragged || !shown) return;
+  read(...shares(event));
+  mark();
+});
 stage.addEventListener("keydown", (event) => {
+  if (event.key === "Enter") mark();
+  if (event.key === "Escape") measure([]);
   const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
   if (!step) return;
   event.preventDefault();
@@ -155,7 +200,7 @@ stage.addEventListener("keydown", (event) => {
   read(from.x + step[0] / 50, from.y + step[1] / 50);
 });
 slider.addEventListener("input", split);
-own.addEventListener("change", () => shown && paint());
+fixed.addEventListener("change", () => shown && paint());
 for (const button of element.querySelectorAll(".hd-modes button")) {
   button.addEventListener("click", () => setMode(button.dataset.mode));
 }

@@ -13,8 +13,9 @@ from hudepth.base.camera import CameraLike, Intrinsics
 from hudepth.base.errors import DataError
 from hudepth.data.store import to_mm
 from hudepth.demo.answers import Answer, Limits, answer, colour_table, reduce_depth
-from hudepth.inference.model import DepthModel
-from hudepth.viz.colour import colour_depth
+from hudepth.inference.model import DepthModel, load
+from hudepth.viz.colour import auto_scale, colour_depth
+from tests.networks import write_tiny_checkpoint
 
 from .conftest import HOSTILE, encoded
 
@@ -54,9 +55,18 @@ def test_a_small_picture_goes_over_pixel_by_pixel(tmp_path: Path, model: DepthMo
     assert result.shown is result.depth
     np.testing.assert_array_equal(depth_of(result.payload), to_mm(result.depth.metres))
     assert result.payload["max_depth_m"] == 10.0
-    assert str(result.payload["caption"]).startswith("a.png, 80 x 60; ")
+    assert result.payload["scale_m"] == list(auto_scale(result.depth.metres))
+    assert result.payload["facts"][0] == "a.png, 80 x 60"
     photo = base64.b64decode(str(result.payload["photo"]).removeprefix("data:image/jpeg;base64,"))
     assert cv2.imdecode(np.frombuffer(photo, np.uint8), cv2.IMREAD_COLOR).shape == (60, 80, 3)
+
+
+def test_the_edges_are_those_of_the_files(tmp_path: Path, model: DepthModel) -> None:
+    result = answered(tmp_path, model, encoded(60, 83))
+    bits = np.unpackbits(np.frombuffer(base64.b64decode(str(result.payload["edges"])), np.uint8))[: 60 * 83]
+    assert 0 < bits.sum() < bits.size
+    kept = result.depth.point_cloud(edges=False).points_m
+    np.testing.assert_array_equal(result.depth.point_cloud().points_m[bits == 0], kept)
 
 
 def test_of_a_large_picture_depths_are_picked_not_averaged(tmp_path: Path, model: DepthModel) -> None:
@@ -86,17 +96,30 @@ def test_a_portrait_has_square_pixels_and_a_wrong_camera_is_said(tmp_path: Path,
     portrait = answered(tmp_path, model, encoded(800, 547, "JPEG"))
     fx, fy, _, _ = portrait.payload["camera"]
     assert fx == pytest.approx(fy, rel=2e-3)  # the shown picture has whole pixels
-    assert "camera: NYU Depth V2's, assumed" in portrait.payload["caption"]
+    assert "NYU Depth V2's camera assumed: set the field of view" in portrait.payload["facts"]
     wrong = answered(tmp_path, model, encoded(96, 128), camera=(1000, 1100, 639.5, 479.5))
     assert wrong.shown.camera == Intrinsics.of_nyu(96, 128)
-    assert "camera= is not of a picture of this size" in wrong.payload["caption"]
+    assert "The camera that was set cannot have taken a picture of this size" in wrong.payload["facts"]
+
+
+def test_a_visitors_field_of_view_counts(tmp_path: Path) -> None:
+    model = load(write_tiny_checkpoint(tmp_path / "rooms.ckpt"), device="cpu", threads=1)
+    (tmp_path / "a.png").write_bytes(encoded(60, 80))
+    results = [answer(tmp_path / "a.png", model, LIMITS, camera) for camera in (None, "fov=40", "f35=26")]
+    factors = [result.depth.camera_factor for result in results]
+    assert factors[0] == 1 < factors[1]
+    assert [result.payload["max_depth_m"] for result in results] == pytest.approx([10, 10, 10])
+    expected = model.predict(tmp_path / "a.png", camera="fov=40").metres
+    np.testing.assert_array_equal(results[1].depth.metres, expected)
+    assert f"Camera as given, 40 degrees across; depth x {factors[1]:.3f} for it" in results[1].payload["facts"]
+    assert f"Camera as given, 26 mm on 35 mm film; depth x {factors[2]:.3f} for it" in results[2].payload["facts"]
 
 
 def test_an_animation_says_that_one_frame_was_taken(tmp_path: Path, model: DepthModel) -> None:
     file, frames = io.BytesIO(), [Image.new("RGB", (40, 30), (shade, 0, 0)) for shade in (0, 99, 200)]
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:])
     result = answered(tmp_path, model, file.getvalue(), "a.gif")
-    assert str(result.payload["caption"]).endswith("; animated, 3 frames: the first is taken")
+    assert "Animated, 3 frames: the first is taken" in result.payload["facts"]
 
 
 def test_the_table_has_the_colours_of_depth_pictures() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import struct
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 
 from hudepth.data.store import to_mm
+from hudepth.inference.depth_map import jpeg
 from hudepth.inference.model import DepthModel
+from hudepth.viz.colour import auto_scale
 from tests.browser import chromium
 
 from .conftest import HOSTILE, encoded, served, until
@@ -116,26 +119,94 @@ def test_keys_move_the_reading_and_the_slider(tab: Any) -> None:
     assert tab.evaluate("document.querySelector('.hd-line').style.left") == "49%"
 
 
-def test_the_scale_is_in_metres(tab: Any) -> None:
-    assert tab.locator(".hd-ticks span").all_inner_texts() == [f"{metres}.0 m" for metres in range(0, 11, 2)]
-    tab.check(".hd-own input")
-    assert tab.locator(".hd-ticks span").first.inner_text() != "0.0 m"
-    tab.uncheck(".hd-own input")
+def ticks(tab: Any) -> list[float]:
+    return [float(text.removesuffix(" m")) for text in tab.locator(".hd-ticks span").all_inner_texts()]
+
+
+def test_the_scale_is_the_pictures_own_or_fixed_in_metres(tab: Any, model: DepthModel) -> None:
+    near, far = auto_scale(model.predict(PICTURE).metres)
+    assert ticks(tab) == pytest.approx(np.linspace(near, far, 6), abs=0.051)
+    assert "0 to 10 m" in tab.inner_text(".hd-fixed")
+    tab.check(".hd-fixed input")
+    assert ticks(tab) == [0, 2, 4, 6, 8, 10]
+    tab.uncheck(".hd-fixed input")
+
+
+def test_two_points_are_as_far_apart_as_in_the_point_cloud(tab: Any, model: DepthModel) -> None:
+    points = model.predict(PICTURE).point_cloud().points_m.reshape(96, 128, 3)
+    box = tab.locator(".hd-stage").bounding_box()
+    assert tab.inner_text(".hd-measure") == "Click two points to measure how far apart they are."
+    ends = [(90, 110), (5, 8)]
+    for row, column in ends:
+        assert not tab.is_visible(".hd-apart")
+        place = {"x": (column + 0.5) / 128 * box["width"], "y": (row + 0.5) / 96 * box["height"]}
+        tab.locator(".hd-stage").click(position=place)
+    metres = float(np.linalg.norm(points[ends[0]] - points[ends[1]]))
+    shown = float(tab.inner_text(".hd-apart").removesuffix(" m"))
+    assert shown == pytest.approx(metres, abs=0.007)  # depth goes over in millimetres
+    assert f"The two points are {shown:.2f} m apart" in tab.inner_text(".hd-measure")
+    assert tab.locator(".hd-mark:visible").count() == 2
+    tab.focus(".hd-stage")
+    tab.keyboard.press("Enter")
+    assert tab.locator(".hd-mark:visible").count() == 1  # a third point begins anew
+    tab.keyboard.press("Escape")
+    assert tab.locator(".hd-mark:visible").count() == 0
+    tab.mouse.move(1, 1)
+
+
+def test_dragging_the_line_marks_nothing(tab: Any) -> None:
+    box = tab.locator(".hd-stage").bounding_box()
+    share = float(tab.input_value(".hd-slider input")) / 100
+    tab.mouse.move(box["x"] + share * box["width"], box["y"] + 40)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 40, steps=4)
+    tab.mouse.up()
+    assert tab.input_value(".hd-slider input") == "25"
+    assert tab.locator(".hd-mark:visible").count() == 0
+    tab.mouse.move(1, 1)
 
 
 def test_the_downloads_are_what_was_shown(tab: Any, model: DepthModel, tmp_path: Path) -> None:
-    for number, name in enumerate(("a_depth.png", "a_depth.npy", "a_depth.ply")):
+    for number, ending in enumerate(("jpg", "png", "npy", "ply", "glb")):
         with tab.expect_download() as download:
             tab.locator("#downloads button").nth(number).click()
-        assert download.value.suggested_filename == name
-        download.value.save_as(tmp_path / name)
+        assert download.value.suggested_filename == f"a_depth.{ending}"
+        download.value.save_as(tmp_path / f"a_depth.{ending}")
     metres = np.load(tmp_path / "a_depth.npy")
     np.testing.assert_allclose(metres, model.predict(PICTURE).metres, rtol=1e-5, atol=1e-6)
     millimetres = cv2.imread(str(tmp_path / "a_depth.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(millimetres, to_mm(metres))
     head, _, body = (tmp_path / "a_depth.ply").read_bytes().partition(b"end_header\n")
-    assert b"element vertex 12288" in head
-    np.testing.assert_array_equal(np.frombuffer(body, [("p", "<f4", 3), ("c", "u1", 3)])["p"][:, 2], metres.ravel())
+    points = model.predict(PICTURE).point_cloud(edges=False).points_m
+    assert f"element vertex {len(points)}".encode() in head
+    np.testing.assert_allclose(np.frombuffer(body, [("p", "<f4", 3), ("c", "u1", 3)])["p"], points, atol=1e-5)
+    files = ((tmp_path / "a_depth.jpg").read_bytes(), jpeg(model.predict(PICTURE).colourise()))
+    shown, expected = (cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR).astype(int) for file in files)
+    assert np.abs(shown - expected).mean() < 0.5
+    magic, version, length = struct.unpack("<4sII", (tmp_path / "a_depth.glb").read_bytes()[:12])
+    assert (magic, version, length) == (b"glTF", 2, (tmp_path / "a_depth.glb").stat().st_size)
+
+
+def test_the_field_of_view_is_chosen_or_typed(tab: Any, model: DepthModel) -> None:
+    assert "NYU Depth V2's camera assumed: set the field of view" in tab.inner_text(".hd-caption")
+    box = tab.locator("#view input")
+    for typed, camera, words in (("40", "fov=40", "40 degrees across"), ("100", "fov=100", "100 degrees across")):
+        box.fill(typed)
+        box.press("Enter")
+        caption(tab, words)
+        tab.locator(".hd-stage").hover(position={"x": 3, "y": 3})
+        expected = to_mm(model.predict(PICTURE, camera=camera).metres)[0, 0]
+        assert abs(float(tab.inner_text(".hd-reading").removesuffix(" m")) - expected / 1000) < 0.03
+    box.fill("wide")
+    box.press("Enter")
+    tab.locator(".hd-message", has_text="'wide' is not from 5 to 160 degrees").wait_for(timeout=10_000)
+    box.click()
+    tab.get_by_role("option", name="phone, main camera, 26 mm").click()
+    caption(tab, "26 mm on 35 mm film")
+    box.click()
+    tab.get_by_role("option", name="from the file, if it says").click()
+    caption(tab, "NYU Depth V2's camera assumed")
+    tab.mouse.move(1, 1)
 
 
 def test_the_points_are_drawn_and_turn(tab: Any) -> None:
@@ -186,6 +257,23 @@ def test_a_file_that_is_too_large_is_said_and_the_page_goes_on(tab: Any) -> None
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+@pytest.mark.parametrize(("high", "wide"), [(96, 72), (72, 96)], ids=["portrait", "landscape"])
+def test_the_picture_and_its_facts_fill_the_screen(tab: Any, width: int, height: int, high: int, wide: int) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    send(tab, "shape.png", encoded(high, wide))
+    caption(tab, f"shape.png, {wide} x {high}")
+    tab.wait_for_timeout(300)
+    viewer, stage, side = (tab.locator(each).bounding_box() for each in ("#viewer", ".hd-stage", ".hd-side"))
+    assert stage["width"] / stage["height"] == pytest.approx(wide / high, rel=0.02)
+    beside = side["y"] < stage["y"] + stage["height"] / 2
+    assert beside == (width == 1280 and high > wide)
+    empty = viewer["x"] + viewer["width"] - max(each["x"] + each["width"] for each in (stage, side))
+    assert empty < 0.05 * width
+    labels = tab.locator("#downloads button").evaluate_all("all => all.every(e => e.scrollWidth <= e.clientWidth)")
+    assert labels, "a label is cut off"
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
 def test_nothing_is_wider_than_the_screen(tab: Any, width: int, height: int) -> None:
     tab.set_viewport_size({"width": width, "height": height})
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
@@ -195,7 +283,7 @@ def test_nothing_is_wider_than_the_screen(tab: Any, width: int, height: int) -> 
 def test_what_a_session_had_goes_with_it(tab: Any, page: Page) -> None:
     send(tab, "c.png", PICTURE)
     caption(tab, "c.png")
-    assert until(lambda: len(page.files()) == 4)  # the picture and three downloads
+    assert until(lambda: len(page.files()) == 6)  # the picture and five downloads
     tab.close()
     assert until(lambda: page.files() == [])
 

@@ -90,18 +90,31 @@ def test_examples_and_strange_paths_are_never_deleted(tmp_path: Path) -> None:
 def test_the_downloads_agree(model: DepthModel) -> None:
     with Files() as files:
         result = answer(uploaded(files), model, Limits(2**20, 10**6))
-        png, npy, ply = files.write("one", result)
+        written = files.write("one", result)
+        paths = [path for path in written if path is not None]
+        colours, png, npy, ply, glb = paths
         metres = np.load(npy)
         millimetres = cv2.imread(str(png), cv2.IMREAD_UNCHANGED)
         head, _, body = ply.read_bytes().partition(b"end_header\n")
-    assert [path.name for path in (png, npy, ply)] == ["a_depth.png", "a_depth.npy", "a_depth.ply"]
-    assert len(DOWNLOADS) == 3
+        assert glb.read_bytes()[:4] == b"glTF"
+        assert cv2.imread(str(colours)).shape[0] == 60
+    assert [path.name for path in paths] == [f"a_depth.{ending}" for ending in ("jpg", "png", "npy", "ply", "glb")]
+    assert len(DOWNLOADS) == 5
     assert metres.dtype == np.float32
     assert millimetres.dtype == np.uint16
     assert np.abs(metres - millimetres / 1000).max() <= 0.00051
     points = np.frombuffer(body, [("p", "<f4", 3), ("c", "u1", 3)])
-    np.testing.assert_array_equal(points["p"][:, 2], metres.ravel())
+    np.testing.assert_array_equal(points["p"], result.depth.point_cloud(edges=False).points_m)
     assert b"not this camera's own" in head
+
+
+def test_a_format_that_cannot_hold_the_picture_is_left_out(model: DepthModel) -> None:
+    with Files() as files:
+        path = files.uploads / "a.png"
+        path.write_bytes(encoded(1, 66_000))  # longer than a JPEG can be
+        written = files.write("one", answer(path, model, Limits(2**20, 10**6)))
+        assert [path is None for path in written] == [True, False, False, False, False]
+        assert sorted(kept(files.results)) == sorted(path for path in written if path)
 
 
 def test_examples_are_rooms_of_different_kinds(tmp_path: Path) -> None:
