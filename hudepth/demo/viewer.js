@@ -31,9 +31,18 @@ function showResult(result) {
   measure([]);
   stage.style.aspectRatio = cloud.style.aspectRatio = `${result.width} / ${result.height}`;
   find(".hd-viewer").style.setProperty("--hd-high", `${(HEIGHT_VH * result.width) / result.height}vh`);
+  preview(result.photo);
   if (points) points.stale = true;
   paint();
   setMode(mode);
+}
+
+// Of a picture that the browser cannot show, as a HEIC, shows the decoded one.
+function preview(decoded) {
+  const chosen = document.querySelector("#picture img");
+  if (!chosen) return;
+  if (chosen.complete && !chosen.naturalWidth) chosen.src = decoded;
+  else if (!chosen.complete) chosen.addEventListener("error", () => (chosen.src = decoded), { once: true });
 }
 
 // The ends of the colour scale [m].

@@ -229,6 +229,13 @@ def test_a_picture_can_be_pasted(tab: Any) -> None:
     caption(tab, "pasted.png, 128 x 96")
 
 
+def test_a_heic_is_shown_though_the_browser_cannot(tab: Any) -> None:
+    pytest.importorskip("pillow_heif", reason="pillow-heif is not installed").register_heif_opener()
+    send(tab, "phone.heic", encoded(60, 80, "HEIF"))
+    caption(tab, "phone.heic, 80 x 60")
+    tab.wait_for_function("document.querySelector('#picture img').naturalWidth === 80", timeout=10_000)
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_bad_file_is_a_message(tab: Any, name: str) -> None:
     data, expected = HOSTILE[name]
