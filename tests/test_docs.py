@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "photos").mkdir()
     for name in "abcdef":
         cv2.imwrite(str(folder / f"photos/{name}.jpg"), rng.integers(0, 255, (60, 90, 3), np.uint8))
-    cv2.imwrite(str(folder / "photo.jpg"), rng.integers(0, 255, (40, 50, 3), np.uint8))
+    cv2.imwrite(str(folder / "photo.jpg"), rng.integers(0, 255, (200, 250, 3), np.uint8))
     film = cv2.VideoWriter(str(folder / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
     for value in (20, 120, 220):
         film.write(np.full((48, 64, 3), value, np.uint8))
@@ -117,9 +117,10 @@ def test_every_command_composes(command: str) -> None:
             assert compose(task, overrides=cli.rewrite(task, first))
 
 
-def place(command: str) -> float:
-    """Return when to run a command; what resumes a run comes after the trainings."""
-    return next((i for i, task in enumerate(ORDER) if f"hudepth-{task}" in command), 9) + 0.5 * ("resume=" in command)
+def place(command: str) -> tuple[bool, int]:
+    """Return when to run a command: last if it needs what another one of its page makes."""
+    needs = "resume=" in command or "depths=photos_depth" in command
+    return needs, next((i for i, task in enumerate(ORDER) if f"hudepth-{task}" in command), 9)
 
 
 @pytest.mark.slow
@@ -128,10 +129,7 @@ def test_every_command_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("HUDEPTH_CACHE", str(folder / "cache"))
     monkeypatch.setattr(nyu, "COUNT", 20)
     monkeypatch.setattr(nyu, "official_test", lambda: frozenset(range(12, 20)))
-    ordered = sorted(
-        COMMANDS, key=lambda each: next((i for i, task in enumerate(ORDER) if f"hudepth-{task}" in each), 9)
-    )
-    for command in sorted(ordered, key=lambda each: "resume=" in each and 0.5):
+    for command in sorted(COMMANDS, key=place):
         words = shortened(command)
         if not words or words[0] == "source":
             continue  # the tests run inside the environment
@@ -168,8 +166,8 @@ def test_the_python_of_the_pages(folder: Path) -> None:
     code += "\nassert abs(hudepth.load('export/model.onnx').predict('photo.jpg').metres - depth_m).max() < 1e-5\n"
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, text=True, capture_output=True, check=True)
     *predicted, trained = done.stdout.splitlines()
-    assert all(re.fullmatch(r"\(40, 50\) [\d.]+", line) for line in predicted)
-    assert (folder / "points.ply").stat().st_size > 40 * 50 * 15
+    assert all(re.fullmatch(r"\(200, 250\) [\d.]+", line) for line in predicted)
+    assert (folder / "points.ply").stat().st_size > 200 * 250 * 14
     assert re.fullmatch(r"\{'boundary': [\d.]+, 'smoothness': [\d.]+, 'scaling': [\d.]+\}", trained)
 
 
