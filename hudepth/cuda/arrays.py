@@ -52,7 +52,7 @@ class ArrayGraphs:
     def __call__(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return the function's result; raises torch.OutOfMemoryError if the GPU has too little memory."""
         with _ONE_AT_A_TIME, torch.inference_mode():
-            key = array.shape, array.dtype
+            key = graphs.generation(), array.shape, array.dtype
             if known := self._known.get(key):
                 self._known.move_to_end(key)
                 known.source.copy_(torch.from_numpy(array))  # by several threads, unlike NumPy's copies

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 import torch
@@ -26,18 +26,32 @@ def has_graphs(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
+_streams: dict[int, torch.cuda.Stream] = {}
+_generation = 0
+
+
+def generation() -> int:
+    """Return a number that is part of every recording's key: recordings of an earlier one are not replayed."""
+    return _generation
+
+
+def forget() -> None:
+    """Make all recordings so far void: Lightning frees memory of libraries that they use when a Trainer ends."""
+    global _generation
+    _generation += 1
+
+
 @contextmanager
 def beside() -> Iterator[torch.cuda.Stream]:
     """Run on the stream that records: what a library or autograd sets up for a stream then exists there."""
-    global _stream
-    _stream = _stream or torch.cuda.Stream()  # type: ignore[no-untyped-call]
-    _stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(_stream):
-        yield _stream
-    torch.cuda.current_stream().wait_stream(_stream)
-
-
-_stream: torch.cuda.Stream | None = None
+    device = torch.cuda.current_device()
+    if device not in _streams:
+        _streams[device] = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+    stream = _streams[device]
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        yield stream
+    torch.cuda.current_stream().wait_stream(stream)
 
 
 def record(function: Callable[[], Any], *, pool: Any = None) -> Recording:
@@ -46,10 +60,32 @@ def record(function: Callable[[], Any], *, pool: Any = None) -> Recording:
     Everything it reads must stay where it is. Raises RuntimeError if the function waits for the device, as ``.item()``
     does, or takes more memory than there is; whatever else it raises, too.
     """
-    graph = torch.cuda.CUDAGraph()
-    with beside() as stream, torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
-        results = function()
-    return Recording(graph.replay, results, graph.pool())
+    graph, pool = torch.cuda.CUDAGraph(), pool or torch.cuda.graph_pool_handle()
+    try:
+        with beside() as stream, torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
+            results = function()
+    except Exception as error:
+        _close(pool)
+        hidden = (
+            error.__context__ if "captur" in str(error).lower() else None
+        )  # the end of a failed recording fails, too
+        raise (hidden if isinstance(hidden, Exception) else error) from None
+    return Recording(graph.replay, results, pool)
+
+
+def _close(pool: Any) -> None:
+    """Tell the allocator that a recording ended: torch does not if it failed, and nothing would be freed any more."""
+    device = torch.cuda.current_device()
+    for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
+        with suppress(AttributeError, RuntimeError):  # ended after all, or another version of torch
+            getattr(torch._C, name)(device, pool)
+
+
+def used_share(device: torch.device) -> float:
+    """Return the most memory that tensors took so far, over what the device has."""
+    if device.type != "cuda":
+        return 0.0
+    return torch.cuda.max_memory_allocated(device) / torch.cuda.mem_get_info(device)[1]
 
 
 def host_memory(like: torch.Tensor) -> torch.Tensor:

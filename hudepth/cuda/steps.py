@@ -22,6 +22,9 @@ _UNSEEN = ("on_before_zero_grad", "on_before_backward", "on_after_backward", "on
 _READ_LATER = ("index", "emptied")
 """Parts of a batch that a step does not compute from."""
 
+MOST_MEMORY = 0.45
+"""Share of the device's memory that a step may take to be recorded: other batches need as much beside it."""
+
 
 class _Step(NamedTuple):
     """A recorded step: where it reads its batch, and the settings of the optimiser that are part of it."""
@@ -45,25 +48,28 @@ class StepGraphs:
     """
 
     def __init__(self, *, wanted: bool = True) -> None:
-        self.wanted = wanted
+        self.wanted = self._asked = wanted
         self.mode: Literal["usual", "record", "replay"] = "usual"
-        self._batch: Mapping[str, Any] = {}
+        self.clear()
+
+    def start(self, trainer: Trainer) -> None:
+        """Find out whether the steps of this training can be recorded; log why if a GPU's cannot."""
+        self.clear()
+        self._trainer = trainer
+        self.wanted = self._asked and graphs.has_graphs(trainer.strategy.root_device)
+        if self.wanted and (why := _obstacle(trainer)):
+            self._give_up(why)
+
+    def clear(self) -> None:
+        """Forget all steps, and free their memory: another training has other weights in other places."""
         self._steps: dict[Any, _Step] = {}
         self._seen: Counter[Any] = Counter()
         self._rates: list[Tensor] = []
         self._rates_there: list[float] = []
         self._pool: Any = None
 
-    def start(self, trainer: Trainer) -> None:
-        """Find out whether the steps of this training can be recorded; log why if a GPU's cannot."""
-        self._trainer = trainer
-        self.wanted = self.wanted and graphs.has_graphs(trainer.strategy.root_device)
-        if self.wanted and (why := _obstacle(trainer)):
-            self._give_up(why)
-
     def loss(self, compute: Callable[[Mapping[str, Any]], Tensor], batch: Mapping[str, Any]) -> Tensor:
         """Return the loss of a batch; a replay computes all that follows from it, too."""
-        self._batch = batch
         if self.mode == "replay":
             self._step.recording.replay()
             loss: Tensor = self._step.recording.results.clone()  # the next replay overwrites it
@@ -106,6 +112,9 @@ class StepGraphs:
             return known
         self._seen[key] += 1
         if self._seen[key] <= graphs.WARM_UPS:
+            return None
+        if not self._steps and graphs.used_share(self._trainer.strategy.root_device) > MOST_MEMORY:
+            self._give_up("a recorded step holds its memory for itself, and there is too little for two")
             return None
         try:
             self._steps[key] = self._record(step, tensors, optimizer)

@@ -20,6 +20,7 @@ from hudepth.base.instantiate import import_trusted
 from hudepth.base.machine import float32_products
 from hudepth.base.options import Range
 from hudepth.base.types import RawBatch
+from hudepth.cuda import graphs
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
 from hudepth.evaluation.lineage import note_scored
@@ -178,6 +179,7 @@ def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options:
         check_shares(trainer, subset="test", pairs=len(datamodule.split.test))
         with float32_products(tf32=False):  # figures should not depend on the device
             trainer.test(evaluation, datamodule=datamodule, verbose=False)
+        graphs.forget()
     return trainer.is_global_zero
 
 

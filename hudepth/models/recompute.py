@@ -19,7 +19,9 @@ def recomputed(module: nn.Module, *inputs: Any) -> Any:
     def contexts() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
         return nullcontext(), _statistics_kept(module)
 
-    return checkpoint(module, *inputs, use_reentrant=False, context_fn=contexts)
+    random = any(isinstance(each, nn.modules.dropout._DropoutNd) for each in module.modules())
+    # Keeping the generators' state would wait for a GPU, and could not be part of a CUDA graph.
+    return checkpoint(module, *inputs, use_reentrant=False, context_fn=contexts, preserve_rng_state=random)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth.base.errors import ConfigError, TrainingError
 from hudepth.base.types import Batch
+from hudepth.cuda import graphs
 from hudepth.cuda.steps import StepGraphs
 from hudepth.losses.distillation import Distillation
 from hudepth.metrics.collection import validation_metrics, validation_names
@@ -206,6 +207,9 @@ class DepthModule(LightningModule):
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, the schedule."""
         optimizer = self._make_optimizer(self.net.named_parameters())
+        if getattr(getattr(self._trainer, "precision_plugin", None), "scaler", None) is None:
+            # Without a scaler fused updates unscale nothing, but Lightning would refuse to clip their gradients.
+            optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]
         if self._make_scheduler is None:
             return optimizer
         steps = self.trainer.estimated_stepping_batches  # infinite if the training has no end
@@ -226,6 +230,11 @@ class DepthModule(LightningModule):
                 f"now there would be {steps:g}. Leave trainer.accumulate_grad_batches, trainer.limit_train_batches and "
                 "the number of devices as they were, or start a new run."
             )
+
+    def on_fit_end(self) -> None:
+        """Free the memory of recorded steps."""
+        self._graphs.clear()
+        graphs.forget()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the configuration and the split, and averaged weights in place of the trained ones if there are any."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -110,8 +111,9 @@ def strong(steps: int) -> dict[str, Any]:
         (strong(3), lambda: [EMA(decay=0.9)]),
         ({"progressive": [{"size": [16, 32], "until": 0.5}], "max_epochs": 4}, list),
         ({"precision": "bf16-mixed"}, list),
+        ({"precision": "bf16-mixed", "gradient_clip_val": 0.5}, list),
     ],
-    ids=["plain", "clipped-scheduled-averaged", "progressive", "bf16"],
+    ids=["plain", "clipped-scheduled-averaged", "progressive", "bf16", "bf16-clipped"],
 )
 def test_replayed_steps_are_the_usual_ones(
     cache: Path, replays: list[None], options: dict[str, Any], make_callbacks: Any
@@ -243,3 +245,65 @@ def test_a_replayed_step_whose_loss_is_not_finite_is_named(cache: Path, replays:
         messages.append(str(error.value))
     assert replays
     assert messages[0] == messages[1]
+
+
+def test_a_step_that_takes_much_of_the_memory_is_not_recorded(
+    cache: Path, replays: list[None], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graphs, "used_share", lambda _: 0.6)
+    with caplog.at_level(logging.INFO, "hudepth"), with_graphs():
+        train(cache)
+    assert not replays
+    assert any("too little for two" in line for line in caplog.messages)
+
+
+def test_another_training_of_the_same_module_records_its_own_steps(cache: Path, replays: list[None]) -> None:
+    """Its weights may lie elsewhere: Lightning moves them to the CPU and back."""
+    with with_graphs():
+        module, trainer, *_ = train(cache)
+        assert len(replays) > 0
+        for each in module.net.parameters():
+            each.data = each.data.clone()
+        before = [each.clone() for each in module.net.parameters()]
+        replays.clear()
+        again = Trainer(
+            accelerator="cpu", max_epochs=1, enable_progress_bar=False, logger=False, enable_checkpointing=False,
+            enable_model_summary=False, callbacks=[LogLosses()], num_sanity_val_steps=0, limit_train_batches=5,
+        )  # fmt: skip
+        again.fit(module, datamodule=trainer.datamodule)  # type: ignore[attr-defined]
+    assert len(replays) == 5 - graphs.WARM_UPS
+    assert all(not a.equal(b) for a, b in zip(before, module.net.parameters(), strict=True))
+
+
+class Device:
+    """Stands in for torch.cuda while a recording fails as it does there: its end raises another error."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.calls: list[tuple[str, Any]] = []
+        for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
+            monkeypatch.setattr(
+                torch._C, name, lambda *given, name=name: self.calls.append((name, given)), raising=False
+            )
+        monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: None)
+        monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 7))
+        monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+        monkeypatch.setattr(torch.cuda, "graph", self.graph)
+        monkeypatch.setattr(graphs, "beside", nullcontext)
+
+    @contextmanager
+    def graph(self, *_: Any, **__: Any) -> Iterator[None]:
+        try:
+            yield
+        except Exception:
+            raise RuntimeError("CUDA error: operation failed due to a previous error during capture")  # noqa: B904
+
+
+def test_a_failed_recording_tells_its_cause_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Device(monkeypatch)
+
+    def fails() -> None:
+        raise ValueError("the cause")
+
+    with pytest.raises(ValueError, match="the cause"):
+        graphs.record(fails)
+    assert device.calls == [("_cuda_endAllocateToPool", (0, (0, 7))), ("_cuda_releasePool", (0, (0, 7)))]
