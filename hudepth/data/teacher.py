@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tokenize
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -94,7 +93,7 @@ def _prepare(files: Sequence[Path], store: DepthStore, path: Path) -> None:
 def _read(file: Path) -> NDArray[np.float32]:
     try:
         depth = read_depth(file)
-    except (DataError, MemoryError, tokenize.TokenError):  # the last is numpy's, for a header that does not end
+    except DataError:
         depth = np.empty(0)
     wanted = "fiu" if file.suffix == ".npy" else "u"
     if depth.ndim != 2 or depth.dtype.kind not in wanted or (file.suffix == ".png" and depth.dtype.itemsize != 2):

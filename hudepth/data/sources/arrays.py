@@ -22,7 +22,7 @@ def read_npy(path: Path, where: str, *, kinds: str = "uif") -> NDArray[np.generi
     check_file(path)
     try:  # open_memmap reads the header alone, refuses pickles, and finds files that are cut short
         mapped = np.lib.format.open_memmap(path, mode="r")
-    except (ValueError, OSError, OverflowError, TypeError, SyntaxError, EOFError) as error:
+    except Exception as error:  # numpy hands the header to Python's parser, which has many ways to fail
         if "Python objects" in str(error):
             raise DataError(f"{where}: holds Python objects. Save the depth array inside with numpy.save.") from None
         raise DataError(f"{where}: not a complete .npy array of plain numbers. Save it with numpy.save.") from None

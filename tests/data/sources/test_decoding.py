@@ -258,6 +258,8 @@ def test_npy_size_is_checked_before_reading(tmp_path: Path) -> None:
         "{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999, 9999999999999)}\n",
         "{'descr': '<f4', 'shape': (4, 4)}\n",
         "no header\n",
+        "(((((",  # tokenize.TokenError
+        "-" * 9000,  # MemoryError or RecursionError
     ],
 )
 def test_damaged_npy(tmp_path: Path, header: str) -> None:
