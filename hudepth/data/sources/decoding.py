@@ -36,19 +36,20 @@ def read_image(source: Path | bytes, *, where: str = "") -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def read_depth(source: Path | bytes, *, where: str = "") -> NDArray[np.generic]:
+def read_depth(source: Path | bytes, *, where: str = "", mask: bool = False) -> NDArray[np.generic]:
     """Decode a depth map [H, W] without changing its values: PNG of 8 or 16 bits, TIFF, PFM or ``.npy``.
 
     Takes a path, or the bytes of a PNG, TIFF or PFM. Grey may be saved as colour or a palette, and where alpha is 0 the
-    value becomes 0; an array may be [1, H, W] or [H, W, 1]. Raises DataError if the file (in errors: ``where``) is
-    missing, truncated, damaged, too large, of another kind, or has several different channels.
+    value becomes 0; an array may be [1, H, W] or [H, W, 1]. A ``mask`` may be a PNG of fewer bits, whose values are
+    stretched to 8 bits. Raises DataError if the file (in errors: ``where``) is missing, truncated, damaged, too large,
+    of another kind, or has several different channels.
     """
     if isinstance(source, Path) and source.suffix.lower() == ".npy":
         return read_npy(source, where or f"'{source}'")
     data, where = _load(source, where)
     if data[:2] == b"Pf" or data[:2] == b"PF":
         return read_pfm(data, where)
-    _refuse_kind(data, where)
+    _refuse_kind(data, where, mask=mask)
     raw = _decode(data, cv2.IMREAD_UNCHANGED, where)
     if data[:4] in _TIFF and _tiff_tags(data)[1]:
         raise DataError(f"{where}: a TIFF of several pages, and which one is depth is unknown. Keep that one.")
@@ -60,12 +61,12 @@ def read_depth(source: Path | bytes, *, where: str = "") -> NDArray[np.generic]:
     return raw
 
 
-def _refuse_kind(data: bytes, where: str) -> None:
+def _refuse_kind(data: bytes, where: str, *, mask: bool) -> None:
     """Refuse files of kinds that people store depth in, but that are not read or lose values."""
     png = data.startswith(_PNG)
     if png and data[24:26] == b"\x10\x04":  # some releases of OpenCV swap its bytes
         raise DataError(f"{where}: a 16-bit grey PNG with alpha, which is not read. Store it without alpha.")
-    if png and data[24:25] in (b"\x01", b"\x02", b"\x04"):  # decoders stretch them
+    if png and not mask and data[24:25] in (b"\x01", b"\x02", b"\x04"):  # decoders stretch them
         raise DataError(f"{where}: a PNG of {data[24]} bits a pixel, too few for depth. Store 16 bits.")
     if data.startswith(_JPEG):
         raise DataError(f"{where}: a JPEG, whose compression changes depths. Store them as 16-bit PNG or .npy.")

@@ -155,7 +155,7 @@ def _entry_of(key: str, entries: Mapping[str, str]) -> str:
 def masked(pair: RawPair, path: Path) -> RawPair:
     """Return a pair with depth 0 where a mask is 0; DataError if it cannot be read or is of another size."""
     mask: NDArray[np.generic]
-    mask = read_npy(path, f"'{path}'", kinds="uifb") if path.suffix == ".npy" else read_depth(path)
+    mask = read_npy(path, f"'{path}'", kinds="uifb") if path.suffix == ".npy" else read_depth(path, mask=True)
     if mask.shape != pair.depth.shape:
         raise DataError(f"'{path}': a mask of {mask.shape} for depth of {pair.depth.shape}. Copy both again.")
     return RawPair(pair.image, np.where(mask != 0, pair.depth, pair.depth.dtype.type(0)))

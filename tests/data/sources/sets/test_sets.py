@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +221,28 @@ def test_a_mask_of_another_size_is_one_line(tmp_path: Path) -> None:
     assert "a mask of (3, 4) for depth of (24, 32)" in refusal(build("ibims", tmp_path / "set"), tmp_path / "cache")
     (tmp_path / "set/mask_transp/office_02.png").unlink()
     assert "no file '" in refusal(build("ibims", tmp_path / "set"), tmp_path / "cache")
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 16])
+def test_masks_have_any_bit_depth(bits: int, tmp_path: Path) -> None:
+    expected = TREES["ibims"].write(tmp_path)
+    for file in tmp_path.glob("mask_*/*.png"):
+        mask = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) > 0
+        spread = np.zeros((*mask.shape, bits), np.uint8)
+        spread[..., -1] = mask  # the least value above 0
+        file.write_bytes(png_of(np.packbits(spread.reshape(len(mask), -1), axis=1), mask.shape[1], bits))
+    source = build("ibims", tmp_path)
+    for record in source.records():
+        np.testing.assert_array_equal(source.read(record).depth > 0, expected[record.id] > 0)
+
+
+def png_of(rows: np.ndarray, width: int, bits: int) -> bytes:
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, len(rows), bits, 0, 0, 0, 0))
+    pixels = chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)))
+    return b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b"")
 
 
 def test_boolean_masks_are_masks(tmp_path: Path) -> None:
