@@ -26,7 +26,12 @@ class _CurrentStderr(logging.Handler):
     """Writes to the current ``sys.stderr``: a progress bar replaces it, to stay below log lines."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr, flush=True)
+        print(plain(self.format(record)), file=sys.stderr, flush=True)
+
+
+def plain(text: str) -> str:
+    """Return text without what steers a terminal: names and descriptions come from files of strangers."""
+    return "".join(each if each.isprintable() or each == "\n" else "?" for each in text)
 
 
 def setup_logging(level: int = logging.INFO, *, prefix: str = "") -> None:

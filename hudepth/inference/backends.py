@@ -137,8 +137,8 @@ class GraphBackend:
 
 def _read_info(path: Path, text: str) -> ModelInfo:
     if not text:
-        why = "its size and units are unknown. Export a checkpoint with hudepth-export."
-        raise CheckpointError(f"'{path}' was not exported by hudepth: {why}")
+        why = "it is of another program, or made with format=onnx_any_size, which is for other programs"
+        raise CheckpointError(f"'{path}' has no description by hudepth: {why}. Pass format=onnx to hudepth-export.")
     return ModelInfo.from_json(text, where=f"'{path}'")
 
 

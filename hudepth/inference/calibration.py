@@ -35,4 +35,5 @@ class Calibration:
 
     def __str__(self) -> str:
         power = "" if self.power == 1 else f"^{self.power:.3f}"
-        return f"calibrated on {self.fitted_on[:100]}: {self.scale:.3f} depth{power}"
+        words = " ".join(self.fitted_on[:100].split())
+        return f"calibrated on {words}: {self.scale:.3f} depth{power}"

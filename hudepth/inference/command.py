@@ -245,6 +245,6 @@ def _report_cameras(job: Job) -> None:
     if len(used) > 3:
         log.info("camera: %d others, see predictions.json", len(used) - 3)
     if job.model.info.training_focal is None and any(each["known"] for each in job.cameras.values()):
-        log.warning("camera: depth is not scaled, since data.source.camera of this model's training is not known.")
+        log.warning("camera: depth is not scaled, since that of this model's training or calibration is not known.")
     elif job.options.camera == "auto" and not all(each["known"] for each in job.cameras.values()):
         log.info("camera: metres change with the field of view; state it with camera=fov=<degrees> or f35=<mm>")

@@ -109,7 +109,7 @@ class DepthMap:
         return np.hstack([self.image, self.colourise(scale_m=scale_m)])
 
     def point_cloud(
-        self, camera: CameraLike | None = None, *, edges: bool = True, max_uncertainty: float | None = None
+        self, camera: CameraLike | None = None, *, edges: bool = False, max_uncertainty: float | None = None
     ) -> PointCloud:
         """Return one coloured point per pixel, by default with the camera that the depth was predicted for.
 

@@ -87,7 +87,7 @@ class ModelInfo:
         except (ValueError, RecursionError, ConfigError) as error:
             message = f"its model description cannot be read ({error}). Export it again with hudepth-export."
             raise CheckpointError(f"{where}: {message}") from error
-        return replace(info, name=info.name[:100])
+        return replace(info, name=" ".join(info.name[:100].split()))
 
     @classmethod
     def of_checkpoint(

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from hudepth import __version__
 from hudepth.base.camera.intrinsics import Intrinsics
+from hudepth.base.errors import DataError
 
 STEEPEST = 15.0
 """Slope of a surface along the line of sight, over that across it, from which a pixel counts as a depth edge. A floor
@@ -27,7 +28,11 @@ class PointCloud:
     comment: str = ""
 
     def to_ply(self) -> bytes:
-        """Return a binary PLY file (little-endian), whose comment states axes, unit and camera."""
+        """Return a binary PLY file (little-endian), whose comment states axes, unit and camera.
+
+        Raises DataError if there are no points.
+        """
+        self._check()
         kinds = [(name, "<f4") for name in ("x", "y", "z")]
         columns = list(self.points_m.T)
         if self.colours is not None:
@@ -47,7 +52,11 @@ class PointCloud:
         return "\n".join(lines).encode("ascii", "replace") + b"\n" + vertices.tobytes()
 
     def to_glb(self) -> bytes:
-        """Return a binary glTF 2.0 file, which browsers, Blender and phones open: y up, z towards the viewer [m]."""
+        """Return a binary glTF 2.0 file, which browsers, Blender and phones open: y up, z towards the viewer [m].
+
+        Raises DataError if there are no points, which the format does not allow.
+        """
+        self._check()
         points = np.ascontiguousarray(self.points_m * np.array([1, -1, -1], np.float32), "<f4")
         opaque = np.full((len(points), 4), 255, np.uint8)
         if self.colours is not None:
@@ -59,8 +68,7 @@ class PointCloud:
             accessors.append({**accessor, **({"normalized": True} if shape == "VEC4" else {})})
             views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data), "target": 34962})
             binary += data
-        ends = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()} if len(points) else {}
-        accessors[0] |= ends or {"min": [0, 0, 0], "max": [0, 0, 0]}
+        accessors[0] |= {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
         names = {name: number for number, name in enumerate(kinds)}
         document = {
             "asset": {"version": "2.0", "generator": f"hudepth {__version__}", "extras": {"comment": self.comment}},
@@ -72,6 +80,10 @@ class PointCloud:
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def _check(self) -> None:
+        if not len(self.points_m):
+            raise DataError("no point is left. Pass edges=true or a larger max_uncertainty.")
 
     def thin(self, points: int) -> PointCloud:
         """Return at most so many of the points, drawn evenly; the same ones each time."""

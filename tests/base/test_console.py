@@ -130,3 +130,9 @@ def test_logging_is_set_up_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     log.info("one %s", "line")
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", "one line\n")
+
+
+def test_a_line_does_not_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    setup_logging()
+    log.info("camera: %s", "NEX-\x1b]0;title\x07 \x9b2J\r of Köln\n  second line")
+    assert capsys.readouterr().err == "camera: NEX-?]0;title? ?2J? of Köln\n  second line\n"

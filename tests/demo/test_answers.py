@@ -66,7 +66,7 @@ def test_the_edges_are_those_of_the_files(tmp_path: Path, model: DepthModel) -> 
     bits = np.unpackbits(np.frombuffer(base64.b64decode(str(result.payload["edges"])), np.uint8))[: 60 * 83]
     assert 0 < bits.sum() < bits.size
     kept = result.depth.point_cloud(edges=False).points_m
-    np.testing.assert_array_equal(result.depth.point_cloud().points_m[bits == 0], kept)
+    np.testing.assert_array_equal(result.depth.point_cloud(edges=True).points_m[bits == 0], kept)
 
 
 def test_of_a_large_picture_depths_are_picked_not_averaged(tmp_path: Path, model: DepthModel) -> None:

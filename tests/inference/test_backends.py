@@ -23,7 +23,7 @@ def test_an_onnx_file_of_another_model(tmp_path: Path) -> None:
     model.ir_version = 9
     onnx.save(model, str(tmp_path / "other.onnx"))
     for backend in ("onnxruntime", "openvino"):
-        with pytest.raises(CheckpointError, match=r"other.onnx' was not exported by hudepth"):
+        with pytest.raises(CheckpointError, match=r"other.onnx' has no description by hudepth"):
             hudepth.load(tmp_path / "other.onnx", backend=backend)
 
 

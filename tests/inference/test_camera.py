@@ -134,10 +134,10 @@ def test_points_of_a_portrait_of_a_cube_have_its_proportions() -> None:
     depth = DepthMap(depth_m, np.zeros((height, width, 3), np.uint8), 10.0)
     seen = (surface == ROOM_FACES).ravel() & (np.abs(depth_m.ravel() - 2.5) < 1e-3)
     for camera in (f"f={focal:g}", f"fov={math.degrees(2 * math.atan(width / 2 / focal))}"):
-        sides = np.ptp(depth.point_cloud(camera).points_m[seen], axis=0)
+        sides = np.ptp(depth.point_cloud(camera, edges=True).points_m[seen], axis=0)
         assert sides[0] / sides[1] == pytest.approx(1, abs=0.02)
         assert sides[:2] == pytest.approx([1, 1], abs=0.02)
-    assumed = np.ptp(depth.point_cloud().points_m[seen], axis=0)
+    assumed = np.ptp(depth.point_cloud(edges=True).points_m[seen], axis=0)
     assert assumed[0] / assumed[1] == pytest.approx(1, abs=0.02)  # square pixels, whoever took it
 
 

@@ -48,7 +48,7 @@ def test_pictures_and_points() -> None:
     assert (side[:, 64:] == coloured).all()
     assert depth.colourise(legend=False).shape == image.shape
     assert not np.array_equal(depth.colourise(scale_m=(1, 4)), coloured)
-    cloud = depth.point_cloud((500.0, 500.0, 32.0, 24.0))
+    cloud = depth.point_cloud((500.0, 500.0, 32.0, 24.0), edges=True)
     assert len(cloud.points_m) == metres.size
     assert "as given" in cloud.comment
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hudepth.base.camera import Intrinsics
-from hudepth.base.errors import ConfigError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.viz.point_cloud import PointCloud, depth_edges, point_cloud
 
 
@@ -99,13 +99,12 @@ def read_glb(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
         found[name] = np.frombuffer(part, dtype).reshape(accessor["count"], int(accessor["type"][3:]))
     ends = document["accessors"][primitive["attributes"]["POSITION"]]
-    if len(found["POSITION"]):
-        np.testing.assert_array_equal(found["POSITION"].min(axis=0), np.float32(ends["min"]))
-        np.testing.assert_array_equal(found["POSITION"].max(axis=0), np.float32(ends["max"]))
+    np.testing.assert_array_equal(found["POSITION"].min(axis=0), np.float32(ends["min"]))
+    np.testing.assert_array_equal(found["POSITION"].max(axis=0), np.float32(ends["max"]))
     return document, found
 
 
-@given(st.integers(0, 50), st.booleans(), st.integers(0, 99))
+@given(st.integers(1, 50), st.booleans(), st.integers(0, 99))
 def test_a_glb_file_holds_the_points_with_y_up(count: int, coloured: bool, seed: int) -> None:
     random = np.random.default_rng(seed)
     points = random.normal(size=(count, 3)).astype(np.float32)
@@ -157,3 +156,10 @@ def test_a_floor_and_a_slanted_wall_are_no_edges_at_any_resolution(scale: float)
     across = (np.arange(width) - camera.cx)[None] / focal
     wall = np.broadcast_to(3 / (1 - 0.9 * across), (height, width)).astype(np.float32)
     assert not depth_edges(wall, camera).any()
+
+
+def test_no_points_are_no_file() -> None:
+    empty = PointCloud(np.zeros((0, 3), np.float32), None)
+    for write in (empty.to_ply, empty.to_glb):
+        with pytest.raises(DataError, match="no point is left"):
+            write()

@@ -20,7 +20,8 @@ CameraOption = Annotated[str | tuple[float, float, float, float], WORDS]
 CameraLike = str | Intrinsics | Sequence[float] | NDArray[Any]
 """What the library takes for one: the option, intrinsics, their four numbers, or a 3 x 3 camera matrix."""
 _NUMBER = re.compile(r"(fov|f35|f)[=:](\d{1,9}(?:\.\d{0,20})?)")
-_RANGES = {"fov": (1, 160), "f35": (5, 1000), "f": (1, 1e6)}
+_RANGES = {"fov": (6, 135), "f35": (8, 340), "f": (1, 1e6)}
+"""What pictures of a usual shape can have; see :meth:`hudepth.base.camera.intrinsics.Intrinsics.fits`."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,12 @@ class CameraChoice:
                 focal = width / 2 / math.tan(math.radians(self.value / 2))
             elif self.kind == "f35":
                 focal *= math.hypot(height, width) / FILM_DIAGONAL_MM
-            camera = Intrinsics.centred(focal, focal, height, width, origin=f"as given, {self.kind}={self.value:g}")
+            stated = f"{self.kind}={self.value:g}"
+            camera = Intrinsics.centred(focal, focal, height, width, origin=f"as given, {stated}")
+            if not camera.fits(height, width):
+                raise ConfigError(
+                    f"camera: {stated} cannot be of a picture of {width} x {height}, whose focal length would be "
+                    f"{focal:.0f} pixels. Pass another camera=."
+                )
         camera.check_fit(height, width)
         return camera

@@ -157,6 +157,7 @@ def _of_sensor(block: bytes | memoryview, focal_mm: float, height: int, width: i
             per_mm.reverse()
         found.append((focal_mm * per_mm[0], focal_mm * per_mm[1], f"{focal_mm:g} mm, {longer / per_mm[0]:.1f} mm wide"))
     model = _value(block, first.get(_MODEL), longest=64).split(b"\0")[0].decode("ascii", "replace").strip()
+    model = re.sub(r"[^ -~]", "?", model)
     sensor_mm = next((side for name, side in _SENSORS_MM if re.match(name, model)), None)
     if sensor_mm:
         focal = focal_mm * longer / sensor_mm
