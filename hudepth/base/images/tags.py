@@ -19,7 +19,7 @@ def check_tags(data: bytes, where: str) -> None:
     Raises:
         DataError: if they claim more than four times the bytes there are.
     """
-    jpeg = _jpeg_exif(data) if data[:2] == b"\xff\xd8" else b""
+    jpeg = exif_block(data) if data[:2] == b"\xff\xd8" else b""
     starts = [m.start() for m in islice(re.finditer(rb"II\*\0|MM\0\*", data), 9)] if data[4:8] == b"ftyp" else [0]
     blocks = [memoryview(jpeg or data)[at:] for at in starts]  # of an AVIF, from where its EXIF may begin
     overlap = any(sum(min(tag.size, len(each)) for tag in directory(each).values()) > 4 * len(each) for each in blocks)
@@ -28,8 +28,16 @@ def check_tags(data: bytes, where: str) -> None:
         raise DataError(f"{where}: its tags (EXIF) overlap or are too many. Save the picture again without them.")
 
 
-def _jpeg_exif(data: bytes) -> bytes:
-    """Return the EXIF block of a JPEG file: its segments one after another, as Pillow joins them."""
+def exif_block(data: bytes) -> bytes:
+    """Return the EXIF block of a JPEG or PNG file, empty if it has none; of a JPEG its segments joined, as Pillow does.
+
+    Only the headers of segments and chunks are read: nothing is decoded.
+    """
+    if data.startswith(b"\x89PNG"):
+        at = 8
+        while at + 8 <= len(data) and data[at + 4 : at + 8] != b"eXIf":
+            at += 12 + int.from_bytes(data[at : at + 4], "big")
+        return data[at + 8 : at + 8 + int.from_bytes(data[at : at + 4], "big")].removeprefix(b"Exif\0\0")
     at, parts = 2, []
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         length = -1 if data[at + 1] == 0xFF else int.from_bytes(data[at + 2 : at + 4], "big")  # -1: a fill byte

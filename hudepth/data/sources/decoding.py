@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, JpegImagePlugin, PngImagePlugin
 
+from hudepth.base.camera.exif import orientation
 from hudepth.base.errors import DataError
 from hudepth.base.images import MAX_PIXELS, check_pixels, read_bytes
+from hudepth.base.images.tags import exif_block
 from hudepth.data.sources.arrays import read_npy, read_pfm
 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB\x60\x82"
@@ -23,13 +25,20 @@ _TIFF = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
 _EXR, _ZIP = b"v/1\x01", b"PK\x03\x04"
 
 
-def read_image(source: Path | bytes, *, where: str = "") -> NDArray[np.uint8]:
+def read_image(source: Path | bytes, *, where: str = "", upright: bool = False) -> NDArray[np.uint8]:
     """Decode a JPEG or PNG file, or its bytes; grey, RGBA and 16-bit images become 8-bit RGB [H, W, 3].
 
-    An orientation tag is not applied: the depth has none, and the two would no longer match. Raises DataError if the
-    file (in errors: ``where``) is missing, truncated, damaged, too large, or not an image.
+    An orientation tag (EXIF) is not applied: published depth fits the stored pixels. With ``upright``, an image that
+    has one other than 1 is refused. Raises DataError if the file (in errors: ``where``) is missing, truncated, damaged,
+    too large, or not an image.
     """
     data, where = _load(source, where)
+    if upright and (turned := orientation(exif_block(data))) != 1:
+        raise DataError(
+            f"{where}: EXIF orientation {turned}, so its depth may be upright, as hudepth-predict writes it, or as the "
+            "image is stored. Save the image upright (mogrify -auto-orient), or, if its depth fits as it is stored, "
+            "remove the tag (exiftool -Orientation=)."
+        )
     if data[:4] in _TIFF:
         raise DataError(f"{where}: a TIFF cannot be the image of a pair. Store images as JPEG or PNG.")
     bgr = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, where)

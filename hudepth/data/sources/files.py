@@ -8,7 +8,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class FileSource(EncodedSource):
 
     unequal_sizes: bool | None = None
     """Whether image and depth may differ in size, if both show the same view; None if this is no option."""
+    upright: ClassVar[bool] = False
+    """Whether images must not state that they are to be turned: for anybody's files. Published sets fit as stored."""
 
     @abstractmethod
     def folder(self) -> Path:
@@ -39,7 +41,7 @@ class FileSource(EncodedSource):
         """Decode the two files of a pair; see :meth:`Source.read`."""
         image, depth = (inside(self.folder(), name, where="data.root") for name in (record.image, record.depth))
         return make_pair(
-            read_image(image), read_depth(depth),
+            read_image(image, upright=self.upright), read_depth(depth),
             image_where=f"'{image}'", depth_where=f"'{depth}'", unequal=self.unequal_sizes,
         )  # fmt: skip
 

@@ -38,6 +38,7 @@ class FolderSource(FileSource):
     """
 
     name: ClassVar[str] = "folder"
+    upright: ClassVar[bool] = True
 
     root: str | Path | None
     _: KW_ONLY

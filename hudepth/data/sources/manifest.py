@@ -44,6 +44,7 @@ class ManifestSource(FileSource):
     """
 
     name: ClassVar[str] = "manifest"
+    upright: ClassVar[bool] = True
 
     root: str | Path | None
     _: KW_ONLY

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import tracemalloc
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from hudepth.base.errors import DataError
+from hudepth.base.images import read_photo
 from hudepth.data.sources.decoding import image_size, read_depth, read_image
 
 RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
@@ -341,6 +344,24 @@ def png_of(rows: np.ndarray, kind: int, bits: int, palette: bytes = b"") -> byte
     pixels = chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)))
     colours = chunk(b"PLTE", palette) if palette else b""
     return b"\x89PNG\r\n\x1a\n" + header + colours + pixels + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_upright_images_are_those_that_the_reader_of_photos_does_not_turn(kind: str, turn: int) -> None:
+    exif, buffer = Image.Exif(), io.BytesIO()
+    exif[0x0112] = turn
+    Image.fromarray(RGB).save(buffer, kind, exif=exif)
+    data = buffer.getvalue()
+    stored, photo = read_image(data), read_photo(data).rgb
+    if turn == 1:
+        np.testing.assert_array_equal(read_image(data, upright=True), stored)
+        assert photo.shape == stored.shape
+        return
+    with pytest.raises(DataError) as caught:
+        read_image(data, where="'a'", upright=True)
+    assert message(caught).startswith(f"'a': EXIF orientation {turn}, so its depth may be upright")
+    assert photo.shape != stored.shape or np.abs(photo.astype(int) - stored).mean() > 20
 
 
 def test_grey_with_alpha_or_a_palette() -> None:

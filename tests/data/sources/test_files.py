@@ -6,11 +6,16 @@ import os
 import pickle
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from hudepth.base.errors import DataError
 from hudepth.data.sources.files import PerProcess, csv_rows, inside, make_pair
+from hudepth.data.sources.folder import FolderSource
+from hudepth.data.sources.manifest import ManifestSource
+from hudepth.data.sources.sets.kitti import KittiSource
 
 RGB = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 9999, (12, 20), dtype=np.uint16)
@@ -75,3 +80,20 @@ def test_handle_opens_again_after_a_fork(tmp_path: Path, monkeypatch: pytest.Mon
     path.write_bytes(b"2")
     monkeypatch.setattr(os, "getpid", lambda: -1)
     assert handles.get(path) == b"2"
+
+
+def test_anybodys_images_must_be_upright_and_published_ones_are_read_as_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 3  # upside down: sizes fit
+    for folder in ("images", "2011_09_26/2011_09_26_drive_0001_sync/image_02/data"):
+        (tmp_path / folder).mkdir(parents=True)
+        Image.new("RGB", (8, 6)).save(tmp_path / folder / "0000000005.jpg", exif=exif)
+    for folder in ("depths", "val/2011_09_26_drive_0001_sync/proj_depth/groundtruth/image_02"):
+        (tmp_path / folder).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / folder / "0000000005.png"), np.full((6, 8), 2000, np.uint16))
+    (tmp_path / "index.csv").write_text("image,depth\nimages/0000000005.jpg,depths/0000000005.png\n")
+    for source in (FolderSource(tmp_path, encoding="uint16_mm"), ManifestSource(tmp_path, encoding="uint16_mm")):
+        with pytest.raises(DataError, match=r"0000000005\.jpg': EXIF orientation 3, "):
+            source.read(source.records()[0])
+    kitti = KittiSource(tmp_path)
+    assert kitti.read(kitti.records()[0]).image.shape == (6, 8, 3)
