@@ -36,6 +36,8 @@ ENDING = "_depth"
 _SAMPLES = 16
 _FAR_OFF, _OFF = 10.0, 2.0
 """Factors between the medians of predictions and truth that are refused, and warned of."""
+_SMALLEST = 8
+"""Times smaller than its image that a prediction may be: of a handful of pixels, any shape passes for the image's."""
 _TELLING = 0.3  # correlation with the truth that says whether depth or its inverse was predicted
 
 
@@ -124,14 +126,16 @@ class FilePredictions(nn.Module):
         return depth / np.float32(per_m)
 
     def _check_size(self, found: Sequence[int], truth_size: Sequence[int] | None, where: str) -> None:
-        """Refuse a prediction that cannot show the whole image: turned, cropped or padded."""
+        """Refuse a prediction that cannot show the whole image (turned, cropped or padded), or that is tiny."""
         natives = [truth_size] if truth_size else self._store.info["native_sizes"]
-        same_shape = any(abs(found[0] * w - found[1] * h) <= max(h, w) for h, w in natives)
-        if same_shape or tuple(found) == self._size:
+        # less than a pixel of the prediction away from the image's shape: it was rounded to whole pixels
+        alike = [size for size in natives if abs(found[0] * size[1] - found[1] * size[0]) < max(size)]
+        if tuple(found) == self._size or any(max(found) * _SMALLEST >= max(size) for size in alike):
             return
-        sizes = " or ".join(f"{height} x {width}" for height, width in natives[:3])
+        sizes = " or ".join(f"{height} x {width}" for height, width in (alike or natives)[:3])
+        what = "less than an eighth of its image," if alike else "but its image is"
         raise DataError(
-            f"{where} is {found[0]} x {found[1]}, but its image is {sizes} (height x width). Resize it to that, "
+            f"{where} is {found[0]} x {found[1]}, {what} {sizes} (height x width). Resize it to that, "
             f"or pass data.size=[{found[0]},{found[1]}] if it shows the whole image."
         )
 
