@@ -58,7 +58,7 @@ def _test_predictions(options: CommandOptions, files: PredictionOptions) -> None
     if options.checkpoint:
         raise ConfigError("checkpoint, predictions: both are set. Pass one of them.")
     if "_target_" not in (options.data or {}):
-        raise ConfigError("data is not set. Pass data=<the set the predictions are of>, as data=nyu_labeled.")
+        raise ConfigError("data is not set. Pass data=<the set the predictions are of>, as data=nyu_labeled_mat.")
     datamodule = build_data({"cache": options.paths["cache"], **(options.data or {})}, trust=options.trust)
     output = options.output or Path(f"test_{files.predictions.resolve().name}")
     predictions = FilePredictions(files, datamodule)

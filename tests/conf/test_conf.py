@@ -111,6 +111,11 @@ def test_the_jobs_of_every_sweep_compose_and_differ(name: str, count: int) -> No
 
 
 @pytest.mark.slow
+def test_examples_name_the_nyu_that_can_be_downloaded() -> None:
+    told = [path.stem for path in FILES if re.search(r"^#.* data=nyu_labeled\b", path.read_text(), re.MULTILINE)]
+    assert told == ["nyu_labeled"]
+
+
 def test_the_recipe_without_pretraining_is_the_recipe_where_there_is_none() -> None:
     labels = [job.labels["variant"] for job in jobs_of("recipe", "seed=1")]
     assert len(labels) == 12
