@@ -194,6 +194,7 @@ def test_a_compiled_network_trains_to_the_same_and_its_checkpoint_is_like_any_ot
         # a process of its own: the checks of shapes that run in this one cannot be traced
         done = subprocess.run(**script("train", *options, cwd=tmp_path, cache=cache), check=False, timeout=240)
         assert done.returncode == 0, done.stdout
+        assert ("compile: the first step took " in done.stdout) is (compiled == "true")
     eager, compiled_run = (load_checkpoint(str(only_run(tmp_path, name))) for name in ("eager", "compiled"))
     assert eager.state.keys() == compiled_run.state.keys()
     for name, value in eager.state.items():
