@@ -82,7 +82,7 @@ class StepGraphs:
 
     def run(self, step: Callable[[], Any], closure: Callable[[], Any], batch: Mapping[str, Any]) -> None:
         """Take a step: ``step`` is Lightning's own, and ``closure`` the part of it that computes loss and gradients."""
-        if not self.wanted or self._trainer.accumulate_grad_batches != 1:
+        if not self.wanted or self._trainer.accumulate_grad_batches != 1:  # callbacks may change the latter
             step()
             return
         optimizer = self._trainer.optimizers[0]
@@ -174,6 +174,8 @@ def _obstacle(trainer: Trainer) -> str:
     """Return why the steps of a training cannot be recorded; empty if they can."""
     if not isinstance(trainer.strategy, SingleDeviceStrategy):
         return f"{type(trainer.strategy).__name__} shares gradients among processes"
+    if trainer.accumulate_grad_batches != 1:
+        return f"trainer.accumulate_grad_batches={trainer.accumulate_grad_batches} adds up gradients"
     if getattr(trainer.precision_plugin, "scaler", None) is not None:
         return f"trainer.precision={trainer.precision} scales gradients"
     if trainer._detect_anomaly:

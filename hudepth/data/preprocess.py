@@ -51,7 +51,7 @@ def preprocess(
 
 
 class TrainingBatches:
-    """Augments and normalises training batches: on a GPU as a CUDA graph, else some 200 small kernels."""
+    """Augments and normalises training batches: on a GPU as a CUDA graph, since it is many small kernels."""
 
     def __init__(self, augment: Augmentation | None, *, max_depth_m: float) -> None:
         self.augment, self.max_depth_m = augment, max_depth_m
