@@ -16,14 +16,16 @@ __version__ = "0.1.0"
 __all__ = ["DepthMap", "DepthModel", "load"]
 
 
-def __getattr__(name: str) -> Any:
-    modules = {
-        "DepthMap": "hudepth.inference.depth_map", "DepthModel": "hudepth.inference.model",
-        "load": "hudepth.inference.model",
-    }  # fmt: skip
-    if name in modules:
-        return getattr(import_module(modules[name]), name)
-    raise AttributeError(f"module 'hudepth' has no attribute '{name}'")
+if not TYPE_CHECKING:  # or a type checker would take any name for one that exists
+
+    def __getattr__(name: str) -> Any:
+        modules = {
+            "DepthMap": "hudepth.inference.depth_map", "DepthModel": "hudepth.inference.model",
+            "load": "hudepth.inference.model",
+        }  # fmt: skip
+        if name in modules:
+            return getattr(import_module(modules[name]), name)
+        raise AttributeError(f"module 'hudepth' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:

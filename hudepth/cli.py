@@ -174,9 +174,10 @@ def _run_hydra(task: str) -> int:
     from hydra.types import RunMode
 
     if task == "train":
-        from hydra_plugins.hudepth import Sweep
+        from hudepth.sweep.sweeper import Sweep
 
-        Plugins.instance().register(Sweep)
+        # Hydra takes sweepers of this name only. What is installed as hydra_plugins, every program with Hydra imports.
+        Plugins.instance().class_name_to_class["hydra_plugins.hudepth.Sweep"] = Sweep
     errors: list[Exception] = []
 
     def job(cfg: Any) -> Any:  # pickled by launchers that run jobs in other processes
@@ -196,7 +197,7 @@ def _run_hydra(task: str) -> int:
             errors.append(error)
             return None
 
-    hydra.main(config_path="pkg://hudepth.conf", config_name=task, version_base="1.3")(job)()
+    hydra.main(config_path=str(conf_folder()), config_name=task, version_base="1.3")(job)()
     for error in errors[:-1]:
         print(f"hudepth-{task}: {one_line(error, task)}", file=sys.stderr)
     if errors:

@@ -17,10 +17,11 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 from hudepth import cli
+from hudepth.base.verbs import conf_folder
 from hudepth.data.sources import nyu
 
 ROOT = Path(__file__).parents[1]
@@ -112,7 +113,7 @@ def test_every_command_composes(command: str) -> None:
     task = script.removeprefix("hudepth-")
     if not {"--help", "--cfg", "-m"} & set(words) and "resume=" not in command:
         GlobalHydra.instance().clear()
-        with initialize_config_module("hudepth.conf", version_base="1.3"):
+        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
             first = [re.sub(r"^([\w.]+=[^\[{,]*),.*", r"\1", word) for word in words]  # of the values of a sweep
             assert compose(task, overrides=cli.rewrite(task, first))
 
@@ -229,5 +230,4 @@ def test_make_help_lists_every_target() -> None:
 def test_the_version_is_said_once_everywhere() -> None:
     from hudepth import __version__
 
-    assert f'version = "{__version__}"' in (ROOT / "pyproject.toml").read_text()
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__

@@ -11,15 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SHIPPED = (
-    "hudepth/",
-    "conf/",
-    "experiments/strong_official/__init__.py",
-    "experiments/strong_official/nyu/",
-    "pyproject",
-    "README",
-    "LICENSE",
-)
+SHIPPED = ("hudepth/", "conf/", "experiments/strong_official/nyu/", "pyproject", "README", "LICENSE")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -32,7 +24,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if name.startswith(SHIPPED) and (ROOT / name).is_file():
             (folder / "src" / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / "src" / name).write_bytes((ROOT / name).read_bytes())
-    build = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
+    build = "from hatchling import build; print(build.build_wheel('.'))"
     subprocess.run([sys.executable, "-c", build], cwd=folder / "src", capture_output=True, check=True)
     (wheel,) = (folder / "src").glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
@@ -44,16 +36,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_holds_every_module_and_configuration(site: Path) -> None:
     for folder, inside in ((ROOT / "hudepth", "hudepth"), (ROOT / "conf", "hudepth/conf")):
         for path in folder.rglob("*"):
-            if path.suffix in (".py", ".yaml") or path.name == "py.typed":
+            if path.is_file() and path.suffix != ".pyc":
                 place = site / inside / path.relative_to(folder)
-                if path.parent.name == "hydra_plugin":
-                    place = site / "hydra_plugins" / "hudepth" / path.name
                 assert place.is_file(), path
 
 
 def test_the_wheel_brings_a_model(site: Path) -> None:
-    held = {path.name for path in (site / "hudepth" / "pretrained").rglob("*") if path.is_file()}
-    assert held == {"__init__.py", "config.json", "model.safetensors", "README.md"}
+    held = {str(path.relative_to(site / "hudepth/pretrained")) for path in (site / "hudepth/pretrained").rglob("*.*")}
+    assert {"nyu/config.json", "nyu/model.safetensors", "nyu/README.md", "nyu/metrics/eigen.json"} < held
     assert (site / "hudepth" / "pretrained" / "nyu" / "model.safetensors").stat().st_size < 10_000_000
 
 

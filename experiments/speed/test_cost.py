@@ -17,14 +17,13 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-import hudepth.conf
 import torch
 import yaml
 from lightning.pytorch import Trainer
 from torch import nn
 
+from hudepth.base.verbs import conf_folder
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.dataset import StoreDataset
 from hudepth.data.preprocess import preprocess
@@ -40,7 +39,7 @@ NAMES = ("paper", "eigen", "eigen_flip", "densedepth", "guided", "raw_holes")
 
 def protocol(name: str) -> Protocol:
     """Read a protocol of the configuration, without its further measures."""
-    text = (Path(str(hudepth.conf.__file__)).parent / "protocol" / f"{name}.yaml").read_text()
+    text = (conf_folder() / "protocol" / f"{name}.yaml").read_text()
     options = {k: v for k, v in yaml.safe_load(text).items() if k not in ("_target_", "boundary", "strata")}
     return Protocol(**options)
 

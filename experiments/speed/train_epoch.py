@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_module
+from hydra import compose, initialize_config_dir
 from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import OmegaConf
 
@@ -29,6 +29,7 @@ from hudepth.base.devices import without_known_warnings
 from hudepth.base.instantiate import instantiate
 from hudepth.base.machine import keep_freed_memory
 from hudepth.base.types import Batch
+from hudepth.base.verbs import conf_folder
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.preprocess import preprocess
@@ -45,7 +46,7 @@ def read_config(experiment: str, *, size: int, overrides: list[str]) -> dict[str
         "data.progressive=null", "model.weights=none", "logger=none", "callbacks.panels=0", "trainer.max_epochs=1",
         "trainer.limit_val_batches=0", "trainer.accelerator=cpu",
     ]  # fmt: skip
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         config: Any = OmegaConf.to_container(compose("train", [*fixed, *overrides]), resolve=True)
     return dict(config)
 

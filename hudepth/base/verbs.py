@@ -13,11 +13,15 @@ OWN_COMMAND = {("data", "calibrate")}
 """Verbs that need more than their script's command may import: they run the function of their own name."""
 
 
+def shipped(inside: str, beside: str) -> Path:
+    """Return a folder that an installed wheel has inside the package, and the repository beside it."""
+    package = Path(__file__).parents[1]
+    return folder if (folder := package / inside).is_dir() else package.parent / beside
+
+
 def conf_folder() -> Path:
     """Return the folder of the configuration tree."""
-    import hudepth.conf
-
-    return Path(str(hudepth.conf.__file__)).parent
+    return shipped("conf", "conf")
 
 
 def options_of(group: str) -> list[str]:

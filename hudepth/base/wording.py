@@ -132,12 +132,12 @@ def _config_line(error: BaseException, task: str) -> str | None:
 
 def known_keys(task: str) -> list[str]:
     """Return all dotted keys and groups of the task's configuration, with the groups chosen on the command line."""
-    from hydra import compose, initialize_config_module
+    from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
     GlobalHydra.instance().clear()
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         try:
             config = compose(task, overrides=_chosen_groups())
         except Exception:  # a group chosen that this task does not have, which may be the very mistake

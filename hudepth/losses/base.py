@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, ClassVar
 
 import torch
@@ -26,6 +26,7 @@ class Loss(nn.Module, ABC):
 
     weights: Mapping[str, float] = {}
     """Of each term; 1 if not listed."""
+    __call__: Callable[..., LossTerms]  # which torch declares to return anything
 
     def forward(self, pred: DepthMap, target: DepthMap, image: Float[Tensor, "b 3 h w"], valid: Mask) -> LossTerms:
         """Return the weighted sum and each raw term, in float32 (float64 for float64) even under autocast.

@@ -31,7 +31,9 @@ __all__ = [
 ]  # fmt: skip
 
 
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        return getattr(import_module("hudepth.metrics.collection"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            return getattr(import_module("hudepth.metrics.collection"), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

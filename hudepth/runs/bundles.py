@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import json
 import zipfile
-from importlib.util import find_spec
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from hudepth.base.errors import CheckpointError
+from hudepth.base.verbs import shipped
 
 CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
 KIND = "hudepth-bundle"
@@ -30,10 +30,8 @@ MAX_WEIGHTS_BYTES = 1 << 32
 
 def pretrained(name: str) -> Path:
     """Return the folder of one of :data:`PRETRAINED`. Raises CheckpointError if this installation lacks it."""
-    spec = find_spec("hudepth.pretrained")
-    folders = list(spec.submodule_search_locations or []) if spec else []
-    folder = next((path for root in folders if is_bundle(path := Path(root) / name)), None)
-    if folder is None:
+    folder = shipped(f"pretrained/{name}", f"experiments/strong_official/{name}")
+    if not is_bundle(folder):
         fix = "Install hudepth again, or pass a run or a file."
         raise CheckpointError(f"checkpoint: the weights of '{name}' are not part of this installation. {fix}")
     return folder

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
@@ -31,7 +31,7 @@ def names(group: str) -> list[str]:
 
 def composed(*overrides: str, task: str = "train") -> dict[str, object]:
     GlobalHydra.instance().clear()
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(verbs.conf_folder()), version_base="1.3"):
         config = OmegaConf.to_container(compose(task, overrides=list(overrides)), resolve=True)
     assert isinstance(config, dict)
     return {str(key): value for key, value in config.items()}
@@ -176,5 +176,5 @@ def test_every_file_opens_with_a_comment_and_experiments_with_their_command(path
 @pytest.mark.parametrize("task", ["train", "test", "data"])
 def test_every_task_composes(task: str) -> None:
     GlobalHydra.instance().clear()
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(verbs.conf_folder()), version_base="1.3"):
         assert compose(task)

@@ -7,11 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from hudepth.base.instantiate import instantiate
 from hudepth.base.types import Batch
+from hudepth.base.verbs import conf_folder
 from hudepth.data.augment import Augmentation
 from hudepth.losses.distillation import Distillation
 from hudepth.training.module import DepthModule
@@ -22,7 +23,7 @@ LOSSES = ("badcl", "berhu", "gradient", "l1", "l2", "mixture", "silog")
 
 
 def config_of(*overrides: str) -> dict[str, Any]:
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         config: Any = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
     return dict(config)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from hydra import compose, initialize_config_module
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
@@ -29,7 +29,7 @@ OWN = {
 def warnings(caplog: pytest.LogCaptureFixture, task: str, *words: str, times: int = 1) -> list[str]:
     caplog.clear()
     GlobalHydra.instance().clear()
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(verbs.conf_folder()), version_base="1.3"):
         config = OmegaConf.to_container(compose(task, overrides=cli.rewrite(task, list(words))), resolve=True)
     assert isinstance(config, dict)
     datamodule = build_data(config["data"], trust=[])

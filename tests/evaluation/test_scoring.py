@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from torch.nn import functional
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.types import Batch
+from hudepth.base.verbs import conf_folder
 from hudepth.data.sources.base import Record
 from hudepth.evaluation.grids import SUM_COLUMNS
 from hudepth.evaluation.scoring import BatchScores, BatchTruth, image_table
@@ -126,7 +126,7 @@ def test_eigen_protocol() -> None:
 
 
 def test_eigen_protocol_is_what_the_configuration_says() -> None:
-    files = [resources.files("hudepth.conf").joinpath(name) for name in ("base/protocol.yaml", "protocol/eigen.yaml")]
+    files = [conf_folder() / name for name in ("base/protocol.yaml", "protocol/eigen.yaml")]
     base, own = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
     options = {**base, **own}
     assert options.pop("defaults") == ["/base/protocol@_here_", "_self_"]

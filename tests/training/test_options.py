@@ -4,16 +4,17 @@ import os
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_module
+from hydra import compose, initialize_config_dir
 
 from hudepth.base.errors import ConfigError
 from hudepth.base.options import plain
+from hudepth.base.verbs import conf_folder
 from hudepth.training.options import parse_options
 
 
 @pytest.fixture(scope="module")
 def config() -> dict[str, Any]:
-    with initialize_config_module("hudepth.conf", version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return plain(compose("train", overrides=["model=tiny", "trainer.accelerator=cpu"]))
 
 

@@ -1,1 +1,0 @@
-"""The Hydra configuration tree, installed as the package ``hudepth.conf``."""

@@ -1,1 +1,0 @@
-"""Installed as ``hudepth.pretrained``: its folder ``nyu`` is the model that ``checkpoint=nyu`` names."""
