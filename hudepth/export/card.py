@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import yaml
+
 from hudepth import __version__
 from hudepth.base.errors import ConfigError
 from hudepth.base.instantiate import find_class
@@ -14,6 +16,7 @@ from hudepth.inference.model_info import ModelInfo
 from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.runs.checkpoint import Checkpoint
 
+HERE = "<this folder or its zip>"
 CITATION = """@article{turkmen2025hybrid,
   title   = {A Hybrid UNet with Attention and a Perceptual Loss Function for Monocular Depth Estimation},
   author  = {Turkmen, Hamidullah and Akgun, Devrim},
@@ -28,7 +31,7 @@ CITATION = """@article{turkmen2025hybrid,
 
 def model_card(
     checkpoint: Checkpoint, info: ModelInfo, *, name: str, results: Mapping[str, Mapping[str, Any]], parity: str,
-    samples: int = 0, origin: str = "", half: bool = False, trust: Iterable[str] = (),
+    samples: int = 0, origin: str = "", half: bool = False, trust: Iterable[str] = (), address: str = HERE,
 ) -> str:  # fmt: skip
     """Return the card of a model, as Markdown with the header that model hubs read.
 
@@ -42,12 +45,17 @@ def model_card(
         samples: number of sample pictures, which show ``origin``, for example ``test images of nyu_labeled``.
         half: kernels and matrices are stored as 16-bit floats, and there is no ONNX file.
         trust: packages whose data sets may be imported for their terms.
+        address: what ``checkpoint=`` takes: ``hf:owner/name`` of a published bundle.
     """
     source, data_set = str(checkpoint.data.get("source", "unknown")), _source_class(checkpoint, trust)
-    tags = ["depth-estimation", "monocular-depth", *["onnx"] * (bool(parity) and not half), "hudepth"]
+    header = {
+        "library_name": "hudepth", "pipeline_tag": "depth-estimation", "license": data_set.licence,
+        "tags": ["depth-estimation", "monocular-depth", *["onnx"] * (bool(parity) and not half), "hudepth"],
+        "model-index": [{"name": name, "results": _index(results, source)}],
+    }  # fmt: skip
     sections = (
-        f"---\nlibrary_name: hudepth\npipeline_tag: depth-estimation\nlicense: {data_set.licence}\ntags:\n- "
-        + "\n- ".join(tags) + f"\n---\n\n# {name}", _about(info), _use(info, parity, half=half),
+        f"---\n{yaml.safe_dump(header, sort_keys=False)}---\n\n# {name}", _about(info),
+        _use(info, parity, address, half=half),
         _training(checkpoint, source), _results(results), _samples(samples, origin) if samples else "",
         _limits(info, source),
         "## Licence\n\nCode: MIT. Training data: "
@@ -78,7 +86,23 @@ def _about(info: ModelInfo) -> str:
     )
 
 
-def _use(info: ModelInfo, parity: str, *, half: bool) -> str:
+def _index(results: Mapping[str, Mapping[str, Any]], source: str) -> list[dict[str, Any]]:
+    """Return the results as the Hub's ``model-index``, one entry for each protocol."""
+    return [
+        {
+            "task": {"type": "depth-estimation"},
+            "dataset": {"type": source, "name": f"{source}, protocol {protocol}", "split": "test"},
+            "metrics": [
+                {"type": name, "name": metric_info(name).label, "value": result["metrics"]["model"][name]}
+                for name in metric_names("narrow", among=result["metrics"]["model"])
+                if result["metrics"]["model"][name] is not None
+            ],
+        }
+        for protocol, result in results.items()
+    ]
+
+
+def _use(info: ModelInfo, parity: str, address: str, *, half: bool) -> str:
     height, width = info.size
     if half or not parity:
         kind = "kernels and matrices as 16-bit floats; computation uses 32 bits" if half else "float32 tensors"
@@ -92,8 +116,8 @@ def _use(info: ModelInfo, parity: str, *, half: bool) -> str:
             "`model.safetensors` holds float32 tensors, `config.json` describes the network."
         )
     return (
-        "## Use\n\n```bash\nhudepth-predict checkpoint=<this folder or its zip> input=photos\n```\n\n"
-        '```python\nimport hudepth\n\ndepth = hudepth.load("<this folder or its zip>").predict("photo.jpg")\n'
+        f"## Use\n\n```bash\nhudepth-predict checkpoint={address} input=photos\n```\n\n"
+        f'```python\nimport hudepth\n\ndepth = hudepth.load("{address}").predict("photo.jpg")\n'
         "depth.metres  # float32 [height, width], metres along the optical axis\n```\n\n" + files
     )
 

@@ -20,7 +20,7 @@ from hudepth.base.machine import usable_cores
 from hudepth.base.options import Choice, Range, Size, parse
 from hudepth.base.wording import more_room
 from hudepth.export.bundle import halve, write_bundle, zip_folder
-from hudepth.export.card import model_card
+from hudepth.export.card import HERE, model_card
 from hudepth.export.comparison_images import ComparisonImages, find_images
 from hudepth.export.graphs import INPUT, export_onnx, export_openvino, export_program
 from hudepth.export.int8_accuracy import measure_int8
@@ -31,6 +31,7 @@ from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import onnx_session
 from hudepth.models.inference import inference_form
+from hudepth.runs import hub
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 from hudepth.runs.results import read_metrics
 
@@ -58,6 +59,8 @@ class ExportOptions:
     half: bool = False
     zip: bool = False
     name: str | None = None
+    push: str | None = None
+    private: bool = False
     data: Mapping[str, Any] = field(default_factory=dict)
     trust: list[str] = field(default_factory=list)
 
@@ -113,8 +116,7 @@ def export(config: dict[str, Any]) -> None:
         data={"cache": options.cache, **options.data}, trust=options.trust,
     )  # fmt: skip
     output = output_folder(options.output)
-    if "bundle" in options.format:
-        _bundle_name(checkpoint, options)  # before minutes of work
+    _check_bundle(checkpoint, options)  # before minutes of work
     log.info("model: %s; compared on %d %s", info, len(images.compared), images.origin)
     info = replace(info, processing=options.processing)
     record: dict[str, Any] = {}
@@ -198,18 +200,32 @@ def _bundle(work: Work) -> dict[str, Any]:
     card = model_card(
         work.checkpoint, info, name=name, results=results, parity=str(parity), half=options.half,
         samples=len(samples), origin=images.origin, trust=options.trust,
+        address=f"{hub.PREFIX}{options.push}" if options.push else HERE,
     )  # fmt: skip
     write_bundle(folder, kept, info=info, onnx=onnx, card=card, results=results, samples=samples)
     if options.zip:
         zip_folder(folder, work.folder / f"{name}.zip")
         folder = work.folder / f"{name}.zip"
-    return work.keep(folder, parity=parity)
+    record = work.keep(folder, parity=parity)
+    if options.push:
+        record["published"] = hub.push(work.output / name, options.push, private=options.private)
+        log.info("published: %s; use it as checkpoint=%s%s", record["published"], hub.PREFIX, options.push)
+    return record
 
 
 MAKERS: dict[str, Callable[[Work], dict[str, Any]]] = {
     "onnx": _onnx, "onnx_any_size": _onnx_any_size, "torch_export": _torch_export, "openvino": _openvino,
     "int8": _int8, "bundle": _bundle,
 }  # fmt: skip
+
+
+def _check_bundle(checkpoint: Checkpoint, options: ExportOptions) -> None:
+    if "bundle" in options.format:
+        _bundle_name(checkpoint, options)
+    if options.push:
+        if "bundle" not in options.format or options.zip:
+            raise ConfigError("push: the Hub takes a bundle's folder. Pass format=bundle zip=false.")
+        hub.check_login(options.push)
 
 
 def _bundle_name(checkpoint: Checkpoint, options: ExportOptions) -> str:

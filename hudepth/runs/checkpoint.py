@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hudepth.base.errors import CheckpointError, TrainingError
 from hudepth.base.files import written_whole
 from hudepth.models.build import build_network
-from hudepth.runs import bundles
+from hudepth.runs import bundles, hub
 from hudepth.runs.run import LAST, best_checkpoint, find_run, is_run, newest_run
 from hudepth.runs.sections import check_config
 
@@ -103,8 +103,10 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     """Return the file or folder that ``spec`` refers to. Raises CheckpointError if there is none.
 
     ``spec`` is a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run below
-    ``runs``); or one of :data:`hudepth.runs.bundles.PRETRAINED`.
+    ``runs``); one of :data:`hudepth.runs.bundles.PRETRAINED`; or ``hf:owner/name``, a bundle on the Hugging Face Hub.
     """
+    if spec.startswith(hub.PREFIX):
+        return hub.download(spec)
     if spec in bundles.PRETRAINED:
         return bundles.pretrained(spec)
     path = newest_run(runs) if spec == "last" else Path(spec).expanduser()

@@ -3,6 +3,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from huggingface_hub import ModelCard
+
 from hudepth.export.card import model_card
 from hudepth.inference.model_info import ModelInfo
 from hudepth.runs.checkpoint import load_checkpoint
@@ -51,3 +53,20 @@ def test_a_card_has_each_metric_with_its_unit_and_interval(tiny: Path) -> None:
     assert "| protocol | images | abs_rel | rmse [m] | delta1 |" in card
     assert "| eigen | 7 | 0.123 [0.100, 0.200] | 0.500 | 0.900 |" in card
     assert card.count("](samples/") == 2
+
+
+def test_the_hub_reads_the_results_of_a_card(tiny: Path) -> None:
+    checkpoint = load_checkpoint(str(tiny))
+    result = {"images": 7, "metrics": {"model": {"abs_rel": 0.1234, "rmse": 0.5, "delta1": 0.9, "log10": None}}}
+    info = ModelInfo.of_checkpoint(checkpoint, parameters=1)
+    text = model_card(
+        checkpoint, info, name="x", results={"eigen": result}, parity="", address="hf:owner/x",
+    )  # fmt: skip
+    data = ModelCard(text).data
+    assert (data.library_name, data.pipeline_tag, data.model_name) == ("hudepth", "depth-estimation", "x")
+    assert data.tags == ["depth-estimation", "monocular-depth", "hudepth"]
+    found = {each.metric_type: each for each in data.eval_results}
+    assert {name: each.metric_value for name, each in found.items()} == {"abs_rel": 0.1234, "rmse": 0.5, "delta1": 0.9}
+    assert found["rmse"].metric_name == "rmse [m]"
+    assert found["rmse"].dataset_name == f"{checkpoint.data['source']}, protocol eigen"
+    assert 'hudepth.load("hf:owner/x")' in text
