@@ -34,13 +34,13 @@ MAX_JPEG_SIDE = 65_500
 class DepthMap:
     """The depth of each pixel of an image."""
 
-    metres: Float[np.ndarray, "h w"]  # distance along the optical axis [m], float32
-    image: UInt8[np.ndarray, "h w 3"]  # the image it was predicted from, upright, RGB
-    max_depth_m: float  # maximum depth the model can predict for this camera [m]
-    notes: tuple[str, ...] = ()  # what reading changed in the image, if it is not obvious
-    camera: Intrinsics | None = None  # which took the image, in its pixels, or is assumed; None: NYU's is
-    camera_factor: float = 1.0  # by which the network's depth was multiplied for that camera
-    uncertainty_m: Float[np.ndarray, "h w"] | None = None  # with flip: half the difference of the two predictions [m]
+    metres: Float[np.ndarray, "h w"]  #: distance along the optical axis [m], float32
+    image: UInt8[np.ndarray, "h w 3"]  #: the image it was predicted from, upright, RGB
+    max_depth_m: float  #: maximum depth the model can predict for this camera [m]
+    notes: tuple[str, ...] = ()  #: what reading changed in the image, if it is not obvious
+    camera: Intrinsics | None = None  #: which took the image, in its pixels, or is assumed; None: NYU's is
+    camera_factor: float = 1.0  #: by which the network's depth was multiplied for that camera
+    uncertainty_m: Float[np.ndarray, "h w"] | None = None  #: with flip: half the difference of the two predictions [m]
 
     def __repr__(self) -> str:
         height, width = self.metres.shape

@@ -24,19 +24,19 @@ MAX_SIDE = 8192  # descriptions that ask for larger images are refused
 class ModelInfo:
     """What is known about a model."""
 
-    name: str  # class of the network, for example HybridUNet
-    size: Annotated[tuple[int, int], Range(1, MAX_SIDE)]  # (height, width) of the images the network takes
+    name: str  #: class of the network, for example HybridUNet
+    size: Annotated[tuple[int, int], Range(1, MAX_SIDE)]  #: (height, width) of the images the network takes
     max_depth_m: Annotated[float, Range(0, 1e6, above=True)]
     """Maximum depth [m]; the network predicts depth / max_depth_m."""
     parameters: int
-    epoch: int  # finished epochs of training
-    trained_on: dict[str, Any] = field(default_factory=dict)  # source, fingerprint, encoding and split of the data
-    aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT  # width over height of the original training images
+    epoch: int  #: finished epochs of training
+    trained_on: dict[str, Any] = field(default_factory=dict)  #: source, fingerprint, encoding and split of the data
+    aspect: Annotated[float, Range(0.01, 100)] = USUAL_ASPECT  #: width over height of the original training images
     focal: tuple[Focal, Focal] | None = None
     """Focal lengths of the training camera over the sides of its pictures, horizontal and vertical; see
     :attr:`training_focal`."""
-    calibration: Calibration | None = None  # is applied to the metres that the network predicts
-    processing: bool = True  # whether a graph maps RGB bytes to metres, else normalised images to unit depth
+    calibration: Calibration | None = None  #: is applied to the metres that the network predicts
+    processing: bool = True  #: whether a graph maps RGB bytes to metres, else normalised images to unit depth
 
     def __str__(self) -> str:
         source, size = self.trained_on.get("source") or "unknown data", f"{self.size[0]} x {self.size[1]}"

@@ -1,4 +1,4 @@
-"""Boundary-Aware Depth Consistency Loss (Turkmen and Akgun 2025, sections 3.2 to 3.4).
+"""Boundary-Aware Depth Consistency Loss (Turkmen and Akgun 2025, sections 3.2 to 3.4)::
 
     L_boundary   = 1/N sum_i B(i) |D^(i) - D(i)|        B(i) = exp(sqrt(Ix^2 + Iy^2))
     L_smoothness = 1/N sum_i |D^_x(i)| exp(-|Ix(i)|) + |D^_y(i)| exp(-|Iy(i)|)
@@ -58,7 +58,7 @@ def luma(image: Float[Tensor, "b 3 h w"]) -> DepthMap:
 def boundary_weight(
     image_dx: Float[Tensor, "b c h w"], image_dy: Float[Tensor, "b c h w"], *, sign: str = "plus"
 ) -> DepthMap:
-    """B = exp(+-|grad I|), the gradient's magnitude averaged over channels (equation 2).
+    """``B = exp(+-|grad I|)``, the gradient's magnitude averaged over channels (equation 2).
 
     The differences of the image are expected without gradient: the root has none at 0. ``sign``: "plus" stresses edges,
     as the paper says of B; "minus" spares them. Raises ConfigError if it is neither.
@@ -113,8 +113,8 @@ def scaling_loss(
 ) -> Float[Tensor, ""]:
     """Mean over valid pixels of an error that is scaled by s (equation 4; see :func:`scaling_factor`), on unit depth.
 
-    ``mode`` is "weight": s |D^ - D|, as printed; or "align": |s D^ - D|, the usual alignment of scale. ``gradient`` is
-    "flow" through s, or "stop" there. Raises ConfigError if an option is unknown.
+    ``mode`` is "weight": ``s |D^ - D|``, as printed; or "align": ``|s D^ - D|``, the usual alignment of scale.
+    ``gradient`` is "flow" through s, or "stop" there. Raises ConfigError if an option is unknown.
     """
     check_choices(scale_mode=mode, scale_gradient=gradient)
     factor = scaling_factor(pred, target, valid, per=per, eps=eps)

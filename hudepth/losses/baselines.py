@@ -31,9 +31,9 @@ def l2_loss(pred: DepthMap, target: DepthMap, valid: Mask) -> Float[Tensor, ""]:
 
 
 def berhu_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, threshold: float = 0.2) -> Float[Tensor, ""]:
-    """Reverse Huber: |e| up to c, (e^2 + c^2) / (2 c) above (Laina et al. 2016).
+    """Reverse Huber: ``|e|`` up to c, ``(e^2 + c^2) / (2 c)`` above (Laina et al. 2016).
 
-    c = ``threshold`` * the largest |e| among the valid pixels of the batch; no gradient flows through it.
+    c = ``threshold`` * the largest ``|e|`` among the valid pixels of the batch; no gradient flows through it.
     """
     error = difference(pred, target, valid).abs()
     # tiny: without any error c is 0, and the branch not taken must not divide by it

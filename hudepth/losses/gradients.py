@@ -1,6 +1,8 @@
 """Gradient matching at several scales (Li and Snavely, CVPR 2018; MiDaS, Ranftl et al. 2022).
 
-R = ln D^ - ln D        L = sum over scales k of mean(|R_x| + |R_y|) at every 2^k-th pixel
+With R = ln D^ - ln D::
+
+    L = sum over scales k of mean(|R_x| + |R_y|) at every 2^k-th pixel
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Aligns predictions with their ground truth, image by image, before scoring.
 
-With p the prediction and t the ground truth at the valid pixels of one image:
+With p the prediction and t the ground truth at the valid pixels of one image::
 
     median          p * median(t) / median(p)                          Zhou et al. 2017
     least_squares   s p + o,  s and o minimise sum (s p + o - t)^2     Ke et al. 2024 (Marigold)

@@ -3,7 +3,7 @@
 Frames of a scene resemble each other, so they are not independent draws; scenes are. Each repeat draws as many scenes
 as there are, with replacement, and computes the metrics of all their frames. The interval lies between two percentiles
 of the repeats, moved outwards for few scenes as if their mean followed Student's t (the expanded percentile interval of
-Hesterberg 2015, What teachers should know about the bootstrap):
+Hesterberg 2015, What teachers should know about the bootstrap)::
 
     p = Phi(-sqrt(n / (n - 1)) * t_(n - 1)),  n scenes, t the quantile that leaves (1 - level) / 2 above it
 

@@ -1,10 +1,10 @@
 """How well depth edges are predicted: three published measures, per image.
 
-``edge_*``: Hu et al. 2019 ("Revisiting Single Image Depth Estimation", WACV): pixels of steep depth, at three
-    thresholds.
-``si_boundary_f1``: Bochkovskii et al. 2024 ("Depth Pro", arXiv 2410.02073, section 3.2): which of two neighbours is
-    nearer, by depth ratio; independent of the prediction's scale.
-``dbe_*_px``: Koch et al. 2018 (iBims-1, arXiv 1805.01328): distance between predicted and true edges.
+- ``edge_*``: Hu et al. 2019 ("Revisiting Single Image Depth Estimation", WACV): pixels of steep depth, at three
+  thresholds.
+- ``si_boundary_f1``: Bochkovskii et al. 2024 ("Depth Pro", arXiv 2410.02073, section 3.2): which of two neighbours is
+  nearer, by depth ratio; independent of the prediction's scale.
+- ``dbe_*_px``: Koch et al. 2018 (iBims-1, arXiv 1805.01328): distance between predicted and true edges.
 
 A measure is NaN if the ground truth has no edge, and 0 (the largest, for a distance) if only the prediction has none.
 So the ground truth alone decides which images count. All measures depend on the resolution of the image and of depth

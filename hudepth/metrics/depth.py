@@ -1,6 +1,6 @@
 """Standard depth metrics, in metres, over valid pixels.
 
-With p the prediction, t the ground truth, N the valid pixels, d = p - t and g = ln p - ln t:
+With p the prediction, t the ground truth, N the valid pixels, d = p - t and g = ln p - ln t::
 
     abs_rel  = 1/N sum |d| / t           (the paper's ARE)
     sq_rel   = 1/N sum d^2 / t           [m]

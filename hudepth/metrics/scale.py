@@ -1,6 +1,6 @@
 """What of an image's error is its scale in metres, and what remains within the image.
 
-With s = median(t) / median(p) of one image's valid pixels, p the prediction and t the ground truth:
+With s = median(t) / median(p) of one image's valid pixels, p the prediction and t the ground truth::
 
     log_scale          ln s; its standard deviation over images is ``scale_sd``
     abs_rel_aligned    1/N sum |s p - t| / t

@@ -1,4 +1,4 @@
-"""Structural similarity (Wang et al. 2004; Turkmen and Akgun 2025, section 3.5.1).
+"""Structural similarity (Wang et al. 2004; Turkmen and Akgun 2025, section 3.5.1)::
 
     SSIM = (2 mu_p mu_t + C1) (2 cov_pt + C2) / ((mu_p^2 + mu_t^2 + C1) (var_p + var_t + C2))
     C1 = (k1 L)^2,  C2 = (k2 L)^2,  L = data range

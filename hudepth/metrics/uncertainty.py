@@ -1,7 +1,7 @@
 """How well a map of uncertainty tells where a prediction is wrong.
 
 Pixels are taken away, the most uncertain ones first, and the mean error of the rest is watched. With e(f) the mean
-relative error of what is left without the fraction f, and o(f) the same in order of the errors themselves,
+relative error of what is left without the fraction f, and o(f) the same in order of the errors themselves::
 
     ause = mean over f of (e(f) - o(f)) / e(0),  f = 0, 0.01, ... 0.99
 
