@@ -5,7 +5,7 @@ INSTALLED := .venv/.installed
 # each test process would compile every module again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install demo test test-all test-gpu lint ledger format clean
+.PHONY: help install demo test test-all test-gpu lint docs ledger format clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -35,6 +35,9 @@ lint: $(INSTALLED)  ## ruff and mypy --strict
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: $(INSTALLED)  ## build the documentation into build/docs, with every warning an error
+	$(BIN)/python -m sphinx --fail-on-warning --nitpicky --quiet docs build/docs
 
 ledger: $(INSTALLED)  ## check every claim of the paper; ARGS="--runs DIR ..." adds runs as evidence
 	$(BIN)/python -m experiments.ledger $(ARGS)

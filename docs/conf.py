@@ -1,0 +1,61 @@
+"""The documentation site: ``make docs`` builds it into build/docs. Its Markdown pages are those that GitHub shows."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "_site"))
+PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+project = "hudepth"
+author = "The hudepth authors"
+project_copyright = author
+release = version = PROJECT["version"]
+
+extensions = [
+    "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "option_tables",
+    "link_check", "repository_links", "signatures",
+]  # fmt: skip
+exclude_patterns = ["README.md", "_site"]
+nitpicky = True
+# the inventories of other projects are on the network; every name of hudepth must be found
+nitpick_ignore_regex = [("py:.*", r"(?!hudepth\b).*")]
+
+# Markdown
+myst_heading_anchors = 3
+
+# Notebooks
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+nb_output_stderr = "remove"
+
+# Docstrings
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+napoleon_google_docstring, napoleon_numpy_docstring = True, False
+python_maximum_signature_line_length = 88
+add_module_names = False
+toc_object_entries_show_parents = "hide"
+
+# Pages
+html_theme = "pydata_sphinx_theme"
+html_title = "hudepth"
+html_static_path = ["_site/static"]
+templates_path = ["_site/templates"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_sidebars = {"**": ["all-pages"]}
+html_theme_options = {
+    "navbar_center": [],
+    "navbar_align": "left",
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "show_prev_next": True,
+    "show_toc_level": 2,
+}
