@@ -19,6 +19,7 @@ from hudepth.report.ablation.pictures import draw_pictures
 from hudepth.report.ablation.report import Report, make_report
 from hudepth.report.ablation.rows import sort_runs
 from hudepth.report.ablation.tables import print_table, table_md, table_tex
+from hudepth.report.ablation.words import finding
 from hudepth.runs.sweeps import Sweep, read_jobs, read_sweep
 
 FOLDER = "report"  # within the sweep's folder, unless overridden
@@ -62,6 +63,7 @@ def report_sweep(options: SweepOptions) -> None:
         log.warning("%s", line)
     print_table(report)
     _write(report, sweep, output_folder(output, within=None if options.output else options.dir), options)
+    log.info("%s", finding(report))
     log.info("page, tables and pictures: %s", (output / "report.html").resolve())
 
 

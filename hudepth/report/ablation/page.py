@@ -66,6 +66,7 @@ def page(
     return _Page(template).substitute(
         policy=_policy(template),
         title=escape(title),
+        finding=escape(words.finding(report)),
         about=escape(about[0].upper() + about[1:]),
         facts=_facts(report, facts or {}),
         warnings=notice if report.warnings else "",
@@ -115,9 +116,9 @@ def _results(report: Report) -> Html:
         heads.append(_sorter(factor.name, is_number=is_number))
         for cells, value in zip(leads.values(), factor.shown, strict=True):
             sorted_by = "" if is_number and value == ABSENT else value
-            cells.append(tag("td", value, data_value=sorted_by, class_=None if is_number else "text"))
+            cells.append(tag("td", value, data_value=sorted_by, class_="factor" if is_number else "factor text"))
     for row in report.rows:
-        leads[row.label].append(tag("td", row.counted, data_value=str(len(row.runs))))
+        leads[row.label].append(tag("td", row.counted, data_value=str(len(row.runs)), class_="factor"))
     return _metrics("Results", report, leads, _result, *heads, _sorter("seeds"))
 
 
@@ -137,24 +138,29 @@ def _metrics(name: str, report: Report, leads: Mapping[str, list[Html]], cell: C
     heads = (_sorter("row", is_number=False), *heads, *(_sorter(words.heading(name)) for name in report.metrics))
     body = []
     for row in (row for row in report.rows if row.label in leads):
-        label = Html(escape(row.label).replace("_", "_<wbr>"))  # a long name breaks between its words
         reference = [Html(" "), tag("span", "reference", class_="tag")] if row.is_reference else []
         differs = [tag("small", f"differs: {'; '.join(row.differs)}", class_="caution")] if row.differs else []
-        head = tag("th", label, *reference, *differs, scope="row", data_value=row.label)
+        head = tag("th", _breakable(row.label), *reference, *differs, scope="row", data_value=row.label)
         cells = (cell(row, metric, digits[metric]) for metric in report.metrics)
         words_of_row = " ".join([row.label, *row.factors]).lower()
         body.append(tag("tr", head, *leads[row.label], *cells, data_filter=words_of_row))
-    return _table(name, heads, body, class_="sortable")
+    return _table(name, heads, body, class_="sortable wide" if len(heads) > 9 else "sortable")
 
 
 def _sorter(name: str, *, is_number: bool = True) -> Html:
     kind, align = ("number", None) if is_number else ("text", "text")
-    return tag("th", tag("button", f"{name} ", type="button"), scope="col", data_kind=kind, class_=align)
+    button = tag("button", _breakable(f"{name} "), type="button")
+    return tag("th", button, scope="col", data_kind=kind, class_=align)
+
+
+def _breakable(name: str) -> Html:
+    """Let a long name break between its words."""
+    return Html(escape(name).replace("_", "_<wbr>"))
 
 
 def _table(name: str, heads: Sequence[str], rows: Sequence[str], *, class_: str | None = None) -> Html:
     table = tag("table", tag("thead", tag("tr", *heads)), tag("tbody", *rows), class_=class_)
-    return tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=name)
+    return tag("div", table, class_="table", role="region", aria_label=name)
 
 
 def _result(row: Row, name: str, digits: int) -> Html:

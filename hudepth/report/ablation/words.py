@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from hudepth.metrics.catalogue import metric_info
-from hudepth.report.ablation.estimates import Interval
-from hudepth.report.ablation.report import Report
+from hudepth.report.ablation.estimates import BETTER, NOT_SHOWN, WORSE, Interval
+from hudepth.report.ablation.report import NAMED, Report
+from hudepth.report.ablation.rows import Row
 
 MOST_PLACES = 7
 
@@ -47,6 +49,34 @@ def about(report: Report) -> str:
     images = len(report.first.table.ids)
     where = f"{scenes} scenes" if any(report.first.table.scenes) else "no scenes named"
     return f"{report.protocol} protocol, {images} test images ({where}) of {data['source']}, {split['kind']} split"
+
+
+def finding(report: Report) -> str:
+    """Return in a few sentences how the rows compare with the reference, in the first metric."""
+    name, reference = report.metrics[0], report.reference
+    digits, compared = places(report)[name], [row for row in report.rows if name in row.contrasts]
+    mean = number(reference.estimates[name].mean, digits) if name in reference.estimates else "-"
+    if not compared:
+        return f"{reference.label} has {name} {mean}; there is no other row to compare it with."
+    groups: dict[str, list[Row]] = {BETTER: [], WORSE: [], NOT_SHOWN: []}
+    for row in sorted(compared, key=lambda row: -abs(row.contrasts[name].value)):
+        groups[row.contrasts[name].verdict].append(row)
+
+    def listed(rows: Sequence[Row]) -> str:
+        shown = ", ".join(f"{row.label} ({number(row.estimates[name].mean, digits)})" for row in rows[:NAMED])
+        return shown + (f" and {len(rows) - NAMED} more" if len(rows) > NAMED else "")
+
+    better = groups[BETTER]
+    lines = [f"{listed(better) or 'No row'} {_is(better)} better than {reference.label} ({mean}) in {name}."]
+    if worse := groups[WORSE]:
+        lines.append(f"{listed(worse)} {_is(worse)} worse.")
+    if same := groups[NOT_SHOWN]:
+        lines.append(f"For {listed(same)} no difference is shown.")
+    return " ".join(lines)
+
+
+def _is(rows: Sequence[Row]) -> str:
+    return "are" if len(rows) > 1 else "is"
 
 
 def seeds(report: Report) -> str:

@@ -13,6 +13,7 @@ import pytest
 from hudepth.report.ablation.page import page
 from hudepth.report.ablation.pictures import Picture
 from hudepth.report.ablation.report import Report
+from hudepth.report.ablation.words import finding
 from tests.browser import chromium
 
 PNG = base64.b64decode(
@@ -154,9 +155,30 @@ def test_the_filter_hides_rows_of_both_tables(tab: Any) -> None:
     assert tab.locator("#results tbody tr:visible").count() == 5
 
 
-def test_a_narrow_screen_scrolls_tables_and_not_the_page(tab: Any) -> None:
-    tab.set_viewport_size({"width": 360, "height": 700})
-    assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+def test_the_finding_comes_first(tab: Any, report: Report) -> None:
+    assert tab.inner_text("main, header").count(finding(report)) == 1
+    tops = [tab.locator(part).bounding_box()["y"] for part in (".lead", "#results table", ".facts", "#differences")]
+    assert tops == sorted(tops)
+
+
+@pytest.mark.parametrize("width", [360, 768, 1000, 1280, 1920])
+def test_no_width_hides_a_column(tab: Any, width: int) -> None:
+    tab.set_viewport_size({"width": width, "height": 800})
+    tab.wait_for_function(f"document.documentElement.scrollWidth <= {width}", timeout=5000)
+    for box in tab.locator("#results tbody td").evaluate_all(
+        "cells => cells.map(cell => [cell.getBoundingClientRect().left, cell.getBoundingClientRect().right])"
+    ):
+        assert 0 <= box[0] < box[1] <= width
+    scrolling = "all => all.filter(e => /auto|scroll/.test(getComputedStyle(e).overflow)).length"
+    assert tab.locator("main *").evaluate_all(scrolling) == 0
+
+
+def test_a_phone_shows_the_first_metric_by_its_name(tab: Any) -> None:
+    tab.set_viewport_size({"width": 390, "height": 800})
+    first = tab.locator("#results tbody td:not(.factor)").first
+    assert first.get_attribute("data-name") == "abs_rel ↓"
+    assert first.bounding_box()["y"] + first.bounding_box()["height"] < 800
+    assert not tab.locator("#results thead").is_visible()
 
 
 def test_the_picture_is_shown(tab: Any) -> None:
