@@ -60,8 +60,14 @@ def _main(task: str) -> int:
     except Exception as error:
         if "debug=true" in debug:
             raise
-        print(f"hudepth-{task}: {one_line(error, task)}", file=sys.stderr)
+        _print_mistake(error, task)
         return 1
+
+
+def _print_mistake(error: Exception, task: str) -> None:
+    from hudepth.base.console import print_error
+
+    print_error(f"hudepth-{task}: {one_line(error, task)}")
 
 
 def __getattr__(name: str) -> Callable[[], int]:
@@ -199,7 +205,7 @@ def _run_hydra(task: str) -> int:
 
     hydra.main(config_path=str(conf_folder()), config_name=task, version_base="1.3")(job)()
     for error in errors[:-1]:
-        print(f"hudepth-{task}: {one_line(error, task)}", file=sys.stderr)
+        _print_mistake(error, task)
     if errors:
         raise errors[-1]
     return 0

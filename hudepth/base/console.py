@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import logging
+import re
+import shlex
 import sys
+import textwrap
 import time
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from hudepth.base.verbs import SUBCOMMANDS
 
 T = TypeVar("T")
 
@@ -22,11 +28,39 @@ _shown = {"level": logging.INFO}
 """The lowest level of log lines that reach the terminal."""
 
 
+_VERBS = "|".join(verb for verbs in SUBCOMMANDS.values() for verb in verbs)
+_COMMAND = re.compile(rf"hudepth-\w+( ({_VERBS})\b| -m\b)?( '[^']*'| [+\w.]+=\S+)*|pip install \S+")
+"""A command in a sentence."""
+
+
 class _CurrentStderr(logging.Handler):
     """Writes to the current ``sys.stderr``: a progress bar replaces it, to stay below log lines."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(plain(self.format(record)), file=sys.stderr, flush=True)
+        print_error(plain(self.format(record)))
+
+
+def print_error(text: str) -> None:
+    """Print to standard error; in a terminal, long lines are broken between words."""
+    print(wrap(text, console.width) if console.is_terminal else text, file=sys.stderr, flush=True)
+
+
+def wrap(text: str, width: int, *, indent: str = "  ") -> str:
+    """Break lines longer than ``width`` [letters] between words.
+
+    Commands and paths, which somebody may copy, stay whole and may be longer. What follows a break is indented by
+    ``indent`` more than the line began.
+    """
+    lines = []
+    for line in text.split("\n"):
+        whole = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
+        begin = line[: len(line) - len(line.lstrip())]
+        broken = textwrap.wrap(
+            whole.lstrip(), max(1, width), initial_indent=begin, subsequent_indent=begin + indent,
+            break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
+        lines += [line] if len(line) <= width else [each.replace("\0", " ") for each in broken]
+    return "\n".join(lines)
 
 
 def plain(text: str) -> str:
@@ -74,6 +108,13 @@ def track(items: Iterable[T], *, total: int, what: str) -> Iterator[T]:
         if now - last > 10:
             last = now
             log.info("%s: %d of %d, %s left", what, done, total, duration((now - start) / done * (total - done)))
+
+
+def typed(command: str, *options: str, **paths: Path) -> str:
+    """Return a command with options that are paths, ``checkpoint=runs/x``, as one types it in this folder."""
+    here = Path.cwd()
+    short = {key: path.relative_to(here) if path.is_relative_to(here) else path for key, path in paths.items()}
+    return shlex.join([command, *(f"{key}={path}" for key, path in short.items()), *options])
 
 
 def duration(seconds: float) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Trainer
 from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
+from lightning.pytorch.callbacks import RichProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 
 from hudepth.base.errors import ConfigError
@@ -25,6 +26,22 @@ GPUS = {
 
 
 _SET_HERE = {"logger", "callbacks", "plugins", "default_root_dir", "use_distributed_sampler"}
+
+
+class ProgressBar(RichProgressBar):
+    """Lightning's progress bar on standard error, with the epochs of the log."""
+
+    def __init__(self) -> None:
+        super().__init__(console_kwargs={"stderr": True})
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return spell_epoch(self.trainer).ljust(len(self.validation_description))
+
+
+def spell_epoch(trainer: Trainer) -> str:
+    """Return ``epoch 3 of 30``, the one that runs or has just ended; without ``of`` if there is no last one."""
+    last = trainer.max_epochs
+    return f"epoch {trainer.current_epoch + 1}" + (f" of {last}" if last is not None and last > 0 else "")
 
 
 def check_devices(options: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ import torch
 from hudepth import __version__
 from hudepth.base.files import write_json, write_text
 from hudepth.base.machine import hardware
-from hudepth.base.tables import Table, stdout
+from hudepth.base.tables import Table, say
 from hudepth.bench.paper import describe_paper
 from hudepth.bench.plan import SETTINGS, Plan
 from hudepth.bench.plot import draw_bench
@@ -74,8 +74,8 @@ def write_report(measured: Measured, *, sentences: Sequence[str] = ()) -> None:
     )
     table.show()
     for line in (LEGEND, *lines, *notes):
-        stdout().print(line, markup=False, highlight=False)
-    print(f"{plan.output / 'bench.md'} has the table, bench.csv its figures, bench.json every time, bench.png a plot.")
+        say(line)
+    say(f"{plan.output / 'bench.md'} has the table, bench.csv its figures, bench.json every time, bench.png a plot.")
 
 
 def bench_table(rows: Sequence[Row], title: str) -> Table:
@@ -84,7 +84,8 @@ def bench_table(rows: Sequence[Row], title: str) -> Table:
         "batch", "contender", "ms/image", "images/s", "x eager", "p50 [ms]", "p25-p75", "p95", "MB", "GFLOP/s",
         "% peak", "diff [mm]",
     )  # fmt: skip
-    table = Table(columns, title=title, left=2)
+    rank = ("ms/image", "images/s", "x eager", "diff [mm]", "MB", "p50 [ms]", "p95", "p25-p75", "GFLOP/s", "% peak")
+    table = Table(columns, title=title, left=2, rank=rank, rest="bench.md")
     for row in rows:
         table.add(
             str(row.batch), row.contender, format_figure(row.ms_per_image), format_figure(row.images_per_s),

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import parse
-from hudepth.base.tables import Table
+from hudepth.base.tables import Table, say
 from hudepth.data.audit.run_audit import audit
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
@@ -38,9 +38,9 @@ def data(config: dict[str, Any]) -> None:
     elif options.verb == "audit":
         audit(config, datamodule)
     elif options.verb == "info":
-        _describe(datamodule).show(show_header=False)
+        _describe(datamodule).show()
     else:
-        print(f"{len(datamodule.store)} pairs in {datamodule.store.path}")
+        say(f"{len(datamodule.store)} pairs in {datamodule.store.path}")
 
 
 def _download(source: Source) -> None:
@@ -53,7 +53,7 @@ def _download(source: Source) -> None:
         raise ConfigError(f"data.root is not set. Pass data.root=<folder for {what.file}, {what.size / 1e9:.2f} GB>.")
     path = Path(root).expanduser()
     path = fetch(what, path if path.name == what.file else path / what.file)
-    print(f"{path}: complete. {source.terms}".rstrip())
+    say(f"{path}: complete. {source.terms}".rstrip())
 
 
 def _describe(datamodule: DepthDataModule) -> Table:

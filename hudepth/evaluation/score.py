@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from lightning.pytorch.callbacks import RichProgressBar
 from numpy.typing import NDArray
 from torch import nn
 
 from hudepth.base.console import log, shows_progress
-from hudepth.base.devices import build_trainer, check_shares, without_known_warnings
+from hudepth.base.devices import ProgressBar, build_trainer, check_shares, without_known_warnings
 from hudepth.base.errors import ConfigError
 from hudepth.base.files import output_folder
 from hudepth.base.instantiate import import_trusted
@@ -24,10 +23,11 @@ from hudepth.cuda import graphs
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.baselines import trivial_baselines
 from hudepth.evaluation.lineage import note_scored
-from hudepth.evaluation.outputs import Metrics, write_outputs
+from hudepth.evaluation.outputs import write_outputs
 from hudepth.evaluation.pictures import draw_beside, evenly_spaced, make_panels
 from hudepth.evaluation.predictions import FilePredictions
 from hudepth.evaluation.protocols import build_protocols
+from hudepth.evaluation.results_table import Metrics, Scored, print_results
 from hudepth.evaluation.routine import Evaluation
 from hudepth.metrics.protocol import Protocol
 from hudepth.models.inference import inference_form
@@ -64,7 +64,7 @@ def score_checkpoint(
     datamodule: DepthDataModule,
     before: nn.Module | None = None,
 ) -> dict[str, Metrics]:
-    """Score a checkpoint and trivial baselines in one pass; write a folder and print a table per protocol.
+    """Score a checkpoint and trivial baselines in one pass; write a folder per protocol and print a table.
 
     Below ``output`` it writes ``<protocol>/metrics.json``, ``per_image.csv``, ``panels.png`` and, if the protocol asks
     for them, ``strata.csv`` and ``strata.png``. ``before`` is the network that the training started from, scored next
@@ -129,13 +129,15 @@ def _score(
     if not run_evaluation(evaluation, datamodule, options.trainer):
         return {}
     stamp = {**_stamp(datamodule), **origin()}
-    results: dict[str, Metrics] = {}
+    scored: list[Scored] = []
     failed = []
     for protocol in protocols:
         try:
-            results[protocol.name] = write_outputs(output / protocol.name, protocol, evaluation, datamodule, stamp)
+            scored.append(write_outputs(output / protocol.name, protocol, evaluation, datamodule, stamp))
         except ConfigError as error:  # the results of the other protocols are not lost
             failed.append(error)
+    print_results(scored, source=datamodule.source.name, files="<protocol>/metrics.json")
+    results = {each.protocol: each.metrics for each in scored}
     for name, metrics in results.items():
         _tell_change(name, metrics)
     if options.panels:
@@ -169,7 +171,7 @@ def run_evaluation(evaluation: Evaluation, datamodule: DepthDataModule, options:
         trainer = build_trainer(
             {"devices": 1, **options},
             logger=False,
-            callbacks=[RichProgressBar()] if shows_progress() else None,
+            callbacks=[ProgressBar()] if shows_progress() else None,
             enable_checkpointing=False,
             enable_model_summary=False,
             enable_progress_bar=shows_progress(),

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from hudepth.base.normalise import denormalise_image
-from hudepth.base.tables import Table, stdout
+from hudepth.base.tables import Table
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.lineage import note_scored
 from hudepth.evaluation.protocols import build_protocols
@@ -76,12 +76,13 @@ def measure_int8(
 
 
 def _print(protocol: str, rows: Mapping[str, Any], *, images: str) -> None:
-    stdout().print(f"int8: {protocol} protocol, {images}; change: int8 minus float32, 95 % interval over scenes")
-    table = Table(["", FLOAT, INT8, "change"])
+    caption = "change: int8 minus float32, with the 95 % interval over scenes"
+    table = Table(["", FLOAT, INT8, "change"], title=f"int8: {protocol} protocol, {images}", caption=caption)
     for key, row in rows.items():
         info, (low, high) = metric_info(key), row["interval"]
         digits = info.decimals + 1  # changes are small
-        interval = "" if low is None or high is None else f" [{low:+.{digits}f}, {high:+.{digits}f}]"
-        values = (f"{row[name]:.{digits}f}" for name in (FLOAT, INT8))
-        table.add(info.label, *values, f"{row['change']:+.{digits}f}{interval}")
+        unit = f" {info.unit}" if info.unit else ""
+        interval = "" if low is None or high is None else f" ({low:+.{digits}f} to {high:+.{digits}f}{unit})"
+        values = (f"{row[name]:.{digits}f}{unit}" for name in (FLOAT, INT8))
+        table.add(info.name, *values, f"{row['change']:+.{digits}f}{unit}{interval}")
     table.show()

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from rich import box
 
 from hudepth.base.console import log
 from hudepth.base.errors import DataError, HudepthError, did_you_mean
 from hudepth.base.files import output_folder, write_json, write_text
 from hudepth.base.options import Range
-from hudepth.base.tables import Cell, Table, stdout
+from hudepth.base.tables import Cell, Table, say
 from hudepth.metrics.bootstrap import LEVEL, REPEATS, SEED, Difference, describe, paired_differences
 from hudepth.metrics.catalogue import metric_info
 from hudepth.metrics.summary import ImageTable
@@ -27,6 +26,7 @@ from hudepth.viz.panels import save_figure, save_panels
 
 PER_IMAGE = ("abs_rel", "rmse")  # metrics of compare.csv, which is sorted by the first
 SHOWN = 12  # images in the right half of compare.png
+WORDS = {"a better": "a", "b better": "b", "no difference shown": "-"}  # of verdicts on a terminal
 Place = Annotated[Path, "run directory | folder of test results"]
 
 
@@ -160,23 +160,23 @@ def print_comparison(a: Result, b: Result, differences: dict[str, Difference], u
     count = uncertainty["scenes"]
     scenes = f"of {count} scene{'s' * (count != 1)}" if any(a.table.scenes) else "without scenes"
     images = f"{len(a.table.ids)} test images {scenes} of {a.data['source']}"
-    lines = f"a: {a.path}\nb: {b.path}\n{a.protocol_name} protocol, {images}, {kinds} split\n"
-    stdout().print(lines, markup=False, highlight=False, soft_wrap=True)
+    say(f"a: {a.path}\nb: {b.path}\n{a.protocol_name} protocol, {images}, {kinds} split\n")
     level = f"{100 * LEVEL:.0f} %"
     table = Table(
-        ["metric", "a", "b", "b - a", f"{level} interval", "verdict"],
+        ["metric", "a", "b", "b - a", f"{level} interval", "better"],
         caption=f"{level} intervals, each metric by itself: {uncertainty['method']}, {uncertainty['repeats']} draws. "
-        "They cover the choice of test scenes, not the seed of the training. ↑ higher is better, ↓ lower.",
+        "They cover the choice of test scenes, not the seed of the training. ↑ higher is better, ↓ lower; "
+        "-: no difference shown.",
     )
     for name, found in differences.items():
         before, after, info = a.metrics[name], b.metrics[name], metric_info(name)
         places = 4 if not max(abs(before), abs(after)) >= 10 else 2
-        word = verdict(name, found)
+        word = WORDS.get(verdict(name, found), "undefined")
         table.add(
             f"{info.label} {info.arrow}",
             *(f"{value:.{places}f}" for value in (before, after)),
             f"{found.value:+.{places}f}",
             f"{found.low:+.{places}f} to {found.high:+.{places}f}",
-            Cell(word, bold=word.endswith("better")),
+            Cell(word, bold=word in ("a", "b")),
         )
-    table.show(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)  # fits into 80 columns
+    table.show()

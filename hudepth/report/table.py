@@ -11,14 +11,12 @@ from typing import Any
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.files import output_folder, write_text
-from hudepth.base.tables import Table, stdout
+from hudepth.base.tables import Table
 from hudepth.metrics.bootstrap import intervals
 from hudepth.metrics.catalogue import metric_info, metric_names
 from hudepth.runs.comparison import merge
 from hudepth.runs.results import Result, find_result
 from hudepth.runs.run import CHECKPOINTS
-
-WIDE, LOG_WIDTH = 190, 200  # letters that all metrics need in a line; of a log
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,16 @@ def write_table(options: TableOptions) -> None:
     ranges = {name: intervals(result.table, **result.averaging) for name, result in results.items()}
     marks = [key for key in rows[0] if key != "name" and key not in names]
 
-    def tabulate(metrics: Sequence[str], *, between: str = " ") -> Table:
-        columns = ["", *marks, *(f"{metric_info(name).label} {metric_info(name).arrow}" for name in metrics)]
-        table = Table(columns, left=1 + len(marks), caption="in brackets: 95 % intervals over scenes")
+    output = output_folder(options.output or "table")
+    heading = {name: f"{metric_info(name).label} {metric_info(name).arrow}" for name in names}
+
+    def tabulate(*, between: str = " ") -> Table:
+        columns = ["", *marks, *heading.values()]
+        rank = [heading[name] for name in dict.fromkeys((*metric_names("headline"), *names))]
+        caption = "in brackets: 95 % intervals over scenes"
+        table = Table(columns, left=1 + len(marks), caption=caption, rank=rank, rest=str(output / "table.csv"))
         for row in rows:
-            cells = (_cell(name, row[name], ranges[row["name"]].get(name), between) for name in metrics)
+            cells = (_cell(name, row[name], ranges[row["name"]].get(name), between) for name in names)
             table.add(row["name"], *(row[key] for key in marks), *cells)
         return table
 
@@ -56,12 +59,10 @@ def write_table(options: TableOptions) -> None:
     for row in rows:
         values = [x for name in names for x in (row[name], *ranges[row["name"]].get(name, (math.nan, math.nan)))]
         numbers.add(row["name"], *(row[key] for key in marks), *(f"{value:.9g}" for value in values))
-    output = output_folder(options.output or "table")
     write_text(output / "table.csv", numbers.to_csv())
-    full = tabulate(names)
+    full = tabulate()
     write_text(output / "table.md", f"{full.to_markdown()}\n{full.caption.capitalize()}.\n")
-    shown = names if stdout(LOG_WIDTH).width >= WIDE else metric_names("headline")
-    tabulate(shown, between="\n").show(LOG_WIDTH)
+    tabulate(between="\n").show()
     log.info("as text: %s", output.resolve())
 
 

@@ -5,7 +5,6 @@ It reads the run directories, so it works for jobs in this process, in others an
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from hudepth.base.console import duration
+from hudepth.base.console import duration, print_error
 from hudepth.base.errors import DataError
 from hudepth.runs import history
 from hudepth.runs.status import FAILED, FINISHED, PRUNED, read_status
@@ -21,11 +20,6 @@ from hudepth.sweep.jobs import Job
 
 EVERY_S = 0.5
 """How often the directories are read."""
-
-
-def say(line: str) -> None:
-    """Print a line of the sweep; the log may be that of a job."""
-    print(line, file=sys.stderr, flush=True)
 
 
 class Progress:
@@ -57,7 +51,7 @@ class Progress:
         for number, (job, watched) in enumerate(self._jobs.items(), start=1):
             while news := watched.news():
                 left = _left("; sweep: ", self._start, sum(e.done for e in every), sum(e.left for e in every))
-                say(f"[{number}/{len(self._jobs)}] {job.name}: {news}{left}")
+                print_error(f"[{number}/{len(self._jobs)}] {job.name}: {news}{left}")
 
 
 def _left(words: str, start: float, done: int, left: int) -> str:

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
 
+from hudepth.base.console import print_error
 from hudepth.base.errors import ConfigError
 from hudepth.base.options import Range
 from hudepth.runs.status import FAILED, FINISHED, PRUNED, read_state, read_status
 from hudepth.sweep.jobs import Job, find_done
-from hudepth.sweep.progress import say
 from hudepth.training.study import TRIAL_ENV, import_optuna, open_study
 
 STUDY_FILE = "study.log"
@@ -138,7 +138,8 @@ def _say_best(study: Any, folder: Path, *, monitor: str) -> None:
     sign = 1 if study.direction.name == "MINIMIZE" else -1
     done.sort(key=lambda trial: sign * float(trial.value or 0))
     pruned = sum(trial.state == states.PRUNED for trial in trials)
-    say(f"search: {len(done)} trials finished, {pruned} pruned, {len(trials) - len(done) - pruned} failed; in {folder}")
+    failed = len(trials) - len(done) - pruned
+    print_error(f"search: {len(done)} trials finished, {pruned} pruned, {failed} failed; in {folder}")
     for place, trial in enumerate(done[:5], start=1):
         values = " ".join(f"{key}={_format_value(value)}" for key, value in trial.params.items())
-        say(f"  {place}. {monitor} {float(trial.value or 0):.4f}: {values} (trial {trial.number})")
+        print_error(f"  {place}. {monitor} {float(trial.value or 0):.4f}: {values} (trial {trial.number})")

@@ -24,6 +24,7 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
+from hudepth.base.console import print_error
 from hudepth.base.errors import ConfigError
 from hudepth.base.machine import usable_cores
 from hudepth.base.options import parse, plain
@@ -31,7 +32,7 @@ from hudepth.base.wording import one_line
 from hudepth.runs.status import FAILED, FINISHED, LOCK, PRUNED, read_state
 from hudepth.runs.sweeps import read_jobs, write_jobs
 from hudepth.sweep.jobs import Job, combine, compose, find_done, merge_overrides
-from hudepth.sweep.progress import Progress, say
+from hudepth.sweep.progress import Progress
 
 Part = Mapping[str, Any] | None
 
@@ -94,8 +95,9 @@ class Sweep(Sweeper):
         done, left = sum(job.finished for job in jobs), sum(job.is_open for job in jobs)
         for job in jobs:
             if job.error:
-                say(f"{job.name}: {job.error}")
-        say(f"sweep {self.name}: {left} of {len(jobs)} jobs to run" + (f", {done} already finished" * bool(done)))
+                print_error(f"{job.name}: {job.error}")
+        ready = f", {done} already finished" * bool(done)
+        print_error(f"sweep {self.name}: {left} of {len(jobs)} jobs to run{ready}")
         try:
             self.run_batch(jobs, jobs, folder)
         except BaseException:
@@ -129,7 +131,7 @@ class Sweep(Sweeper):
                     launcher.launch(commands, initial_job_idx=0)
                 return
             except Exception as error:
-                say(f"the launcher stopped: {one_line(error, 'train')}")
+                print_error(f"the launcher stopped: {one_line(error, 'train')}")
             status = {job: folder / job.folder / "status.json" for job in left}
             waiting = [job for job, file in status.items() if not file.is_file() or file.stat().st_mtime < start]
             if len(waiting) == len(left):
@@ -183,12 +185,12 @@ class Sweep(Sweeper):
         unfinished = len(jobs) - count[FINISHED] - count[FAILED] - count[PRUNED]
         words = [f"{count[state]} {state}" for state in (FINISHED, FAILED, PRUNED) if count[state] or state == FINISHED]
         words += [f"{unfinished} unfinished"] if unfinished else []
-        say(f"sweep {self.name}: {', '.join(words)}; in {folder}")
+        print_error(f"sweep {self.name}: {', '.join(words)}; in {folder}")
         if self.master.test:
-            say(f"table and plots: {self._report_command(folder)}")
+            print_error(f"table and plots: {self._report_command(folder)}")
         if unfinished or count[FAILED]:
             typed = [word for word in sys.argv[1:] if not word.startswith("sweep_dir=")]
-            say("to resume: " + shlex.join(["hudepth-train", *typed, f"sweep_dir={_format_path(folder)}"]))
+            print_error("to resume: " + shlex.join(["hudepth-train", *typed, f"sweep_dir={_format_path(folder)}"]))
         failed = [f"{job.name}: {why}" for job, (state, why) in zip(jobs, outcomes, strict=True) if state == FAILED]
         return failed, unfinished
 

@@ -16,6 +16,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from hudepth.base.console import duration, log
+from hudepth.base.devices import spell_epoch
 from hudepth.data.datamodule import epoch_seed
 from hudepth.data.store import DepthStore
 from hudepth.evaluation.pictures import make_panels
@@ -119,7 +120,7 @@ class EpochLine(Callback):
         left = max(0, (trainer.max_epochs or 0) - epoch)
         values = [f"{name} {metrics[name]:.4f}" for name in self.shown if name in metrics]
         ending = f"{duration(each)} per epoch" + (f", {duration(each * left)} left" if left else "")
-        log.info("epoch %d of %s: %s (%s)", epoch, trainer.max_epochs, ", ".join(values), ending)
+        log.info("%s: %s (%s)", spell_epoch(trainer), ", ".join(values), ending)
 
 
 class Interrupt(Callback):

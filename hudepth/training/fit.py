@@ -12,7 +12,7 @@ from torch.optim import Adam, AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from hudepth.base.camera import CameraChoice
-from hudepth.base.console import log
+from hudepth.base.console import log, typed
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
 from hudepth.base.instantiate import find_class, has_target, import_trusted, instantiate
@@ -28,6 +28,7 @@ from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint, read_plain
+from hudepth.runs.run import best_checkpoint
 from hudepth.training.initial import Parents, Training, network_before, restore_parents
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
@@ -74,7 +75,10 @@ def fit(training: Training) -> float | None:
         before = network_before(training, size=data.size, max_depth_m=data.max_depth_m)
         score_checkpoint(checkpoint, parse(ScoreOptions, tested), output=path / "test", datamodule=data, before=before)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
-    return None if best.best_model_score is None else float(best.best_model_score)
+    value = None if best.best_model_score is None else float(best.best_model_score)
+    if trainer.is_global_zero and best_checkpoint(path):
+        log_end(training, value, epochs=trainer.current_epoch)
+    return value
 
 
 def build_datamodule(training: Training) -> DepthDataModule:
@@ -175,6 +179,22 @@ def log_start(trainer: Trainer, module: DepthModule, data: DepthDataModule) -> N
         split.kind, len(split.train), len(split.val), len(split.test),
         data.batch_size, f" in each of {world} processes" if world > 1 else "",
         type(trainer.accelerator).__name__.removesuffix("Accelerator"), torch.get_num_threads(),
+    )  # fmt: skip
+
+
+def log_end(training: Training, best: float | None, *, epochs: int) -> None:
+    """Log which epoch was best, with its value of the monitored metric, where it is, and what to do with it."""
+    config, options = training.config, training.options
+    checkpoint = load_checkpoint(str(training.path))
+    value = "" if best is None else f": {options.monitor} {best:.4f}"
+    protocols, trust = ",".join(config["protocol"]), [f"trust=[{','.join(options.trust)}]"] * bool(options.trust)
+    chosen = [f"protocol=[{protocols}]"] * (protocols != "paper,eigen")
+    log.info("best epoch: %d of %d%s", checkpoint.epoch, epochs, value)
+    log.info("checkpoint: %s", checkpoint.path)
+    log.info(
+        "to test it, and to predict the depth of your pictures in a folder photos:\n  %s\n  %s",
+        typed("hudepth-test", *chosen, *trust, checkpoint=training.path),
+        typed("hudepth-predict", "input=photos", *trust, checkpoint=training.path),
     )  # fmt: skip
 
 

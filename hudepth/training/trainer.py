@@ -12,11 +12,10 @@ from typing import Any
 
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.callbacks import RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
 from hudepth.base.console import shows_progress
-from hudepth.base.devices import build_trainer
+from hudepth.base.devices import ProgressBar, build_trainer
 from hudepth.base.errors import TrainingError
 from hudepth.base.instantiate import instantiate
 from hudepth.data.datamodule import DepthDataModule
@@ -44,7 +43,7 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
         how = {"every_n_epochs": options["panels_every_n_epochs"], "max_depth_m": datamodule.max_depth_m}
         callbacks.append(PanelPictures(path / "images", datamodule.store, indices, **how))
     if shows_progress() and config["trainer"].get("enable_progress_bar", True):
-        callbacks.append(RichProgressBar(leave=False))
+        callbacks.append(ProgressBar())
     if trial := os.environ.get(TRIAL_ENV):
         callbacks.append(TrialPruner(trial, monitor=monitor))
     if stop := options["early_stopping"]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import logging
 import re
+import shlex
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import hudepth.base.console
-from hudepth.base.console import duration, log, setup_logging, track
+from hudepth.base.console import duration, log, setup_logging, track, typed, wrap
 
 
 @pytest.mark.parametrize(
@@ -136,3 +138,50 @@ def test_a_line_does_not_steer_the_terminal(capsys: pytest.CaptureFixture[str]) 
     setup_logging()
     log.info("camera: %s", "NEX-\x1b]0;title\x07 \x9b2J\r of Köln\n  second line")
     assert capsys.readouterr().err == "camera: NEX-?]0;title? ?2J? of Köln\n  second line\n"
+
+
+@given(text=st.text("abc /-=0", max_size=200), width=st.integers(20, 120))
+def test_lines_are_broken_between_words_only(text: str, width: int) -> None:
+    broken = wrap(text, width)
+    assert broken.split() == text.split()
+    assert all(len(line) <= width or len(line.split()) == 1 for line in broken.splitlines())
+
+
+COMMANDS = (
+    "hudepth-data download data=nyu_labeled_mat data.root=nyu",
+    "hudepth-report sweep dir=sw",
+    "hudepth-train -m loss=l1,silog 'data.fractions=[0.7, 0.1, 0.2]'",
+    "pip install 'hudepth[search]'",
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("place", [0, 5, 11, 19, 40])
+def test_a_command_stays_whole_so_that_it_can_be_copied(command: str, place: int) -> None:
+    line = f"{'x' * place} {command} and so on, in a sentence that goes on"
+    broken = wrap(line, 30)
+    assert command in broken
+    assert " ".join(broken.split()) == line.strip()
+
+
+def test_what_follows_a_break_is_indented() -> None:
+    assert wrap("one two three", 8) == "one two\n  three"
+    assert wrap("  one two three", 10) == "  one two\n    three"
+    assert wrap("short\n\nlines", 8) == "short\n\nlines"
+
+
+def test_a_log_line_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    setup_logging()
+    log.info("word " * 30)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    plain(monkeypatch, terminal=True)
+    log.info("word " * 30)
+    assert max(map(len, capsys.readouterr().err.splitlines())) <= 80
+
+
+def test_a_command_is_spelt_as_one_types_it_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert typed("hudepth-test", checkpoint=tmp_path / "runs" / "a") == "hudepth-test checkpoint=runs/a"
+    assert typed("hudepth-test", checkpoint=Path("/elsewhere/a")) == "hudepth-test checkpoint=/elsewhere/a"
+    line = typed("hudepth-train", "trust=[a,b]", resume=tmp_path / "my runs" / "it's")
+    assert shlex.split(line) == ["hudepth-train", "resume=my runs/it's", "trust=[a,b]"]

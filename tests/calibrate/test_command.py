@@ -42,7 +42,7 @@ DATA = ("data=folder", "data.root=mine", "data.encoding=uint16_mm", "data.source
 def test_a_scale_is_found_stored_and_applied(tiny: Path, mine: Path, command: Command) -> None:
     done = command("data", "calibrate", f"checkpoint={tiny}", *DATA, "camera=fov=60", "output=fitted")
     assert done.code == 0, done.err
-    assert re.search(r"scale +│ +0\.00\d │ +-0\.\d+ │ \[-0\.\d+, -0\.\d+\] │ +yes", done.out)
+    assert re.search(r"scale +0\.00\d +-0\.\d+ +\[-0\.\d+, -0\.\d+\] +yes", done.out)
     assert "calibrated on 8 pairs of folder: 0.700 depth; stored: pass checkpoint=fitted" in done.err
     before, after = hudepth.load(tiny, camera="training"), hudepth.load("fitted", camera="training")
     picture = mine / "images" / "3.png"

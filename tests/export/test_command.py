@@ -108,6 +108,8 @@ def test_int8_says_what_it_costs(exported: Path) -> None:
     log = (exported / "log.txt").read_text()
     assert "int8: eigen protocol, 2 test images of rooms" in log
     assert f"{record['delta1']['int8']:.4f}" in log
+    assert f"{record['rmse']['int8']:.4f} m" in log
+    assert f"{record['rmse']['change']:+.4f} m" in log
 
 
 @pytest.mark.slow

@@ -132,12 +132,13 @@ def test_table_and_picture(tmp_path: Path, other: Path, capsys: pytest.CaptureFi
         "eigen protocol, 654 test images of 215 scenes of nyu_labeled, official split",
         "",
     ]
-    assert lines[4].split() == ["metric", "a", "b", "b", "-", "a", "95", "%", "interval", "verdict"]
+    assert lines[4].split() == ["metric", "a", "b", "b", "-", "a", "95", "%", "interval", "better"]
     abs_rel, rmse, delta1 = (next(x for x in lines if x.startswith(name)) for name in ("abs_rel", "rmse [", "delta1"))
     assert abs_rel.split()[:3] == ["abs_rel", "↓", "0.2241"]
-    assert abs_rel.endswith("b better")
+    assert abs_rel.endswith("  b")
     assert rmse.startswith("rmse [m] ↓")
-    assert rmse.endswith("no difference shown")
+    assert rmse.endswith("  -")
+    assert " ".join(" ".join(lines).split()).endswith("-: no difference shown.")
     assert delta1.startswith("delta1 ↑")
     assert (tmp_path / "out" / "compare.png").read_bytes().startswith(b"\x89PNG")
 

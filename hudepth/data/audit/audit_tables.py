@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from hudepth.base.tables import Cell, Table
+from hudepth.base.tables import Cell, Table, say
 from hudepth.data.audit.duplicates import NEAR_BITS
 from hudepth.data.audit.findings import Finding
 from hudepth.data.audit.leakage import WITHIN, AuditedSplit
@@ -24,14 +24,15 @@ def print_audit(
         table.add(label, *(found.get(label, "-") for found in cells.values()))
     if table.rows:
         table.show()
-    print(
+    say(
         "* the configured split. Frames away: places between two frames of a scene, in order of their numbers.\n"
         f"Near copies: images whose perceptual hashes differ in at most {NEAR_BITS} of 64 bits."
     )
     for kind, reason in splits.items():
         if isinstance(reason, str):
-            print(f"{kind} is not possible: {reason.removeprefix(f'data.split={kind}: ')}")
-    listing = Table(["", "about", "found", "what it means"], title="\nfindings", left=4)
+            say(f"{kind} is not possible: {reason.removeprefix(f'data.split={kind}: ')}")
+    say("")
+    listing = Table(["", "about", "found", "what it means"], title="findings", left=4)
     for finding in sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)):
         severity = Cell(finding.severity, bold=finding.severity == "warning", dim=finding.severity == "ok")
         listing.add(severity, finding.about, finding.found, finding.meaning)

@@ -12,6 +12,7 @@ from hudepth.base.console import log
 from hudepth.base.errors import DataError
 from hudepth.base.files import output_folder, write_json
 from hudepth.base.options import parse
+from hudepth.base.tables import say
 from hudepth.data.audit.audit_tables import print_audit
 from hudepth.data.audit.duplicates import NEAR_BITS, find_duplicates
 from hudepth.data.audit.findings import Finding, judge_depth, judge_split
@@ -90,7 +91,7 @@ def audit(config: Mapping[str, Any], datamodule: DepthDataModule) -> None:
     write_json(output / "audit.json", _to_json(report))
     if store and leaks:
         _draw(output / "leaks.png", store, leaks, kind=kind)
-    print(f"written to {output}: audit.json" + (", leaks.png" if leaks else ""))
+    say(f"written to {output}: audit.json" + (", leaks.png" if leaks else ""))
 
 
 def _audit_split(

@@ -5,32 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from rich import box
-
-from hudepth.base.tables import Cell, Content, Table, escape_latex, escape_markdown, stdout
+from hudepth.base.tables import Cell, Content, Table, escape_latex, escape_markdown, say
 from hudepth.metrics.catalogue import metric_names
 from hudepth.report.ablation import words
 from hudepth.report.ablation.estimates import BETTER, NOT_SHOWN
 from hudepth.report.ablation.report import Report
 from hudepth.report.ablation.rows import Row
 
-LOG_WIDTH = 200  # letters in a line of a log, where all metrics fit
-LONGEST = 28  # letters of a label before it is wrapped on a terminal
 Form = Literal["terminal", "markdown", "latex"]
 
 
 def print_table(report: Report) -> None:
     """Print one row per variant: each metric with its interval over seeds, below it the difference from the reference;
     then a line for each run that does not count."""
-    table = _results(report, _fitting(report), "terminal")
+    table = _results(report, report.metrics, "terminal")
+    table.rank = [words.heading(name) for name in sorted(report.metrics, key=_is_further)]
+    table.rest = "table.csv"
     table.title = f"{words.about(report)}; {words.seeds(report)}"
     table.caption = (
         f"± half the 95 % interval over seeds; below: difference from {report.reference.label}, "
         "better or worse if the intervals over seeds and over scenes both show it; bold: best"
     )
-    table.show(LOG_WIDTH, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    table.show()
     for each in report.troubles:
-        stdout(LOG_WIDTH).print(f"not counted: {each}", markup=False, highlight=False, soft_wrap=True)
+        say(f"not counted: {each}")
 
 
 def table_md(report: Report) -> str:
@@ -100,16 +98,5 @@ def _cell(row: Row, name: str, digits: int, form: Form) -> tuple[Cell, ...]:
     return tuple(part for part in parts if part.text)
 
 
-def _fitting(report: Report) -> list[str]:
-    """Return as many metrics as fit on the terminal, headline metrics first, at least one."""
-    digits, first = words.places(report), metric_names("headline")
-    longest = max(len(row.label) + 12 * row.is_reference for row in report.rows)
-    room = stdout(LOG_WIDTH).width - 12 - min(LONGEST, longest)
-    kept: list[str] = []
-    for name in sorted(report.metrics, key=lambda name: name not in first):
-        texts = (" ".join(part.text for part in _cell(row, name, digits[name], "terminal")) for row in report.rows)
-        room -= 1 + max(len(line) for text in (words.heading(name), *texts) for line in text.splitlines())
-        if room < 0 and kept:
-            break
-        kept.append(name)
-    return [name for name in report.metrics if name in kept]
+def _is_further(name: str) -> bool:
+    return name not in metric_names("headline")
