@@ -65,15 +65,18 @@ def write_outputs(
         if protocol.alignment != "none":
             title += f", each prediction aligned to its ground truth ({protocol.alignment})"
         save_strata(folder / "strata.png", rows, title=title)
-    count = uncertainty["scenes"]
-    over = f"{count} {'scene' if any(model.scenes) else 'image'}{'s' * (count != 1)}"
     if "flip_ause" in metrics[MODEL]:
         found = (metrics[MODEL][name] for name in UNCERTAINTY_NAMES)
         text = "%s protocol: disagreement with the mirrored image: AUSE %.3f, rank correlation with the error %.2f"
         log.info(text, protocol.name, *found)
-    if not any(model.scenes):
-        over += " of unknown scenes"
+    over = _resampled(model, uncertainty["scenes"])
     return Scored(protocol.name, metrics, ranges[MODEL], counted, over, protocol.alignment)
+
+
+def _resampled(table: ImageTable, count: int) -> str:
+    if any(table.scenes):
+        return f"{count} scene{'s' * (count != 1)}"
+    return f"{count} image{'s' * (count != 1)} of unknown scenes"
 
 
 def _left_out(protocol: Protocol, table: ImageTable) -> list[str]:
