@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 from urllib.error import URLError
 
 import torch
@@ -16,9 +15,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.console import log
-from hudepth.base.errors import CheckpointError, did_you_mean
+from hudepth.base.errors import CheckpointError
 from hudepth.models.encoder import Encoder, Stage, run_stage
 from hudepth.models.options import choose
+from hudepth.models.weights import load_fitting, read_state
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 """torchvision's ResNet18_Weights.IMAGENET1K_V1; the name contains the first digits of the file's sha256."""
@@ -117,7 +117,7 @@ class ResNet18Encoder(Encoder):
         return features
 
     def _load(self, weights: str) -> None:
-        state = _download_imagenet() if weights == "imagenet" else _read_weights(Path(weights).expanduser())
+        state = _download_imagenet() if weights == "imagenet" else read_state(weights, fix=_FIX)
         own = self.state_dict()
         has_layer4 = any(name.startswith(LAYER4) for name in own)
         ignored = (CLASSIFIER,) if has_layer4 else (CLASSIFIER, LAYER4)
@@ -125,49 +125,12 @@ class ResNet18Encoder(Encoder):
         without_layer4 = not any(name.startswith(LAYER4) for name in state)
         if without_layer4:
             state |= {name: value for name, value in own.items() if name.startswith(LAYER4)}
-        # torchvision's first files lack the counters of batch norm, which only matter without a momentum
-        state = {name: value for name, value in own.items() if name.endswith("num_batches_tracked")} | state
-        misshapen = {name for name in own.keys() & state.keys() if own[name].shape != state[name].shape}
-        for problem, names in (
-            ("missing", own.keys() - state.keys()),
-            ("unknown", state.keys() - own.keys()),
-            ("of another shape", misshapen),
-        ):
-            if names:
-                found = f"{len(names)} tensors {problem}, the first is '{min(names)}'"
-                raise CheckpointError(f"model.weights: '{weights}' does not fit: {found}. {_FIX}")
-        self.load_state_dict(state)
+        load_fitting(self, state, weights=weights, fix=_FIX)
         if has_layer4 and without_layer4:
             log.warning("model.weights: '%s' has no layer4, which starts at random", weights)
 
 
 _FIX = "Pass a ResNet-18 state_dict with torchvision's parameter names, or model.weights=none."
-
-
-def _read_weights(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        hint = did_you_mean(str(path), ["imagenet", "none"])
-        raise CheckpointError(
-            f"model.weights: no file '{path}'.{hint} Pass imagenet, none, or the path of a ResNet-18 file."
-        )
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise CheckpointError(
-            f"model.weights: '{path}' is not a file of plain tensors ({type(error).__name__}). {_FIX}"
-        ) from error
-    if isinstance(state, dict) and isinstance(inner := state.get("state_dict"), dict):
-        log.info("model.weights: '%s' is a checkpoint; its state_dict is read", path)
-        state = inner
-    for wrapper in ("module.", "_orig_mod."):  # of DataParallel and torch.compile
-        if isinstance(state, dict) and state and all(str(name).startswith(wrapper) for name in state):
-            log.info(
-                "model.weights: '%s' was saved from a wrapped network; '%s' is removed from its names", path, wrapper
-            )
-            state = {str(name).removeprefix(wrapper): value for name, value in state.items()}
-    if not (isinstance(state, dict) and all(isinstance(n, str) and isinstance(v, Tensor) for n, v in state.items())):
-        raise CheckpointError(f"model.weights: '{path}' does not contain a state_dict. {_FIX}")
-    return cast("dict[str, Tensor]", state)
 
 
 def _download_imagenet() -> dict[str, Tensor]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +20,7 @@ from hudepth.models.recompute import recomputed
 class UNet(nn.Module):
     """One normalised RGB image in, one unit depth map of the same size out.
 
-    The decoder has an up block for each of the encoder's stages but the deepest, as wide as that stage.
+    The decoder has an up block for each of the encoder's stages but the deepest, by default as wide as that stage.
 
     Args:
         encoder: at least two stages, each of half the size of the one before, the first of half the image's size.
@@ -27,6 +28,8 @@ class UNet(nn.Module):
         output: from the last convolution to unit depth, one of :data:`hudepth.models.options.OUTPUTS`.
         arithmetic: ``plain`` or ``merged``; see :mod:`hudepth.models.decoder`.
         recompute: in training, recompute each stage's activations for the gradients instead of keeping them.
+        widths: of the up blocks, coarsest first.
+        up_block: makes an up block from the channels of the coarse map, of the skip and of its result.
         **attention: further modules, by attribute name, for :meth:`attend`.
 
     Raises:
@@ -41,6 +44,8 @@ class UNet(nn.Module):
         output: str = "sigmoid",
         arithmetic: str = "plain",
         recompute: bool = False,
+        widths: Sequence[int] | None = None,
+        up_block: Callable[..., nn.Module] | None = None,
         **attention: nn.Module,
     ) -> None:
         super().__init__()
@@ -48,10 +53,12 @@ class UNet(nn.Module):
         self.encoder = encoder
         for name, module in attention.items():
             self.add_module(name, module)
-        channels = [stage.channels for stage in reversed(encoder.stages)]
+        deepest, *skips = [stage.channels for stage in reversed(encoder.stages)]
+        channels = [deepest, *(skips if widths is None else widths)]
+        make = up_block or partial(UpBlock, arithmetic=arithmetic)
         self._up = [f"up{i}" for i in range(1, len(channels))]
-        for name, (coarse, skip) in zip(self._up, pairwise(channels), strict=True):
-            self.add_module(name, UpBlock(coarse, skip, skip, upsample=upsample, arithmetic=arithmetic))
+        for name, (coarse, width), skip in zip(self._up, pairwise(channels), skips, strict=True):
+            self.add_module(name, make(coarse, skip, width, upsample=upsample))
         final = choose("model.output", output, OUTPUTS)()
         self.head = Head(channels[-1], getattr(final, "channels_in", 1), arithmetic=arithmetic)
         self.output = final

@@ -170,7 +170,7 @@ def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as caught:
         ResNet18Encoder.from_pretrained(str(tmp_path / "x.pth"))
     assert str(caught.value) == (
-        f"model.weights: no file '{tmp_path / 'x.pth'}'. Pass imagenet, none, or the path of a ResNet-18 file."
+        f"model.weights: no file '{tmp_path / 'x.pth'}'. Pass imagenet, none, or the path of a file."
     )
 
 
@@ -178,8 +178,7 @@ def test_misspelt_name() -> None:
     with pytest.raises(CheckpointError) as caught:
         ResNet18Encoder.from_pretrained("imagnet")
     assert str(caught.value) == (
-        "model.weights: no file 'imagnet'. Did you mean 'imagenet'? "
-        "Pass imagenet, none, or the path of a ResNet-18 file."
+        "model.weights: no file 'imagnet'. Did you mean 'imagenet'? Pass imagenet, none, or the path of a file."
     )
 
 
