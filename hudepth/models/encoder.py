@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hudepth.models.options import choose
+
 
 class Stage(NamedTuple):
     """A stage of an encoder, which returns one feature map."""
@@ -26,11 +28,23 @@ def run_stage(module: nn.Module, *inputs: Tensor) -> Any:
     return module(*inputs)
 
 
+NORMS = {"trained": False, "frozen": True}
+"""Values of ``model.encoder_norm``: whether batch norm keeps its initial statistics."""
+
+
 class Encoder(nn.Module, ABC):
-    """From a normalised image to one feature map per stage."""
+    """From a normalised image to one feature map per stage.
+
+    ``norm``: batch norm is ``trained``, or ``frozen``: it normalises with the initial statistics, in training too;
+    scale and shift are trained either way. Raises ConfigError for another.
+    """
 
     stages: tuple[Stage, ...]
     """Finest first."""
+
+    def __init__(self, *, norm: str = "trained") -> None:
+        super().__init__()
+        self.norm_frozen = choose("model.encoder_norm", norm, NORMS)
 
     @classmethod
     @abstractmethod
@@ -46,6 +60,14 @@ class Encoder(nn.Module, ABC):
 
         ``run`` runs a stage, for example :func:`hudepth.models.recompute.recomputed`.
         """
+
+    def train(self, mode: bool = True) -> Encoder:
+        """Switch to training mode, but for batch norm if that is frozen."""
+        super().train(mode)
+        for module in self.modules():
+            if self.norm_frozen and isinstance(module, nn.BatchNorm2d):
+                module.eval()
+        return self
 
     def freeze(self, stages: int, *, frozen: bool = True) -> None:
         """Stop training the first stages, or train them again."""

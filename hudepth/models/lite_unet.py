@@ -73,6 +73,8 @@ class LiteUNet(UNet):
         context: the mean of the deepest map joins each of its positions (:class:`PooledContext`).
         upsample, output, arithmetic, recompute: see :class:`hudepth.models.unet.UNet`; ``merged`` concerns the head.
 
+        encoder_norm: batch norm of the encoder: ``trained``, or ``frozen`` to its initial statistics.
+
     Raises:
         ConfigError: for an unknown option.
         CheckpointError: if the weights are missing or do not fit.
@@ -88,9 +90,10 @@ class LiteUNet(UNet):
         upsample: UpsampleMode = "bilinear",
         output: str = "sigmoid",
         arithmetic: Arithmetic = "plain",
+        encoder_norm: str = "trained",
         recompute: bool = False,
     ) -> None:
-        encoder = EfficientNetLite0Encoder.from_pretrained(weights)
+        encoder = EfficientNetLite0Encoder.from_pretrained(weights, norm=encoder_norm)
         super().__init__(
             encoder,
             upsample=upsample,

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from hudepth.base.console import log
 from hudepth.base.errors import CheckpointError
 from hudepth.models.encoder import Encoder, Stage, run_stage
-from hudepth.models.options import choose
 from hudepth.models.weights import load_fitting, read_state
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
@@ -25,9 +24,6 @@ IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 
 LAYER4, CLASSIFIER = "layer4.", "fc."
 """Prefixes of the tensors of a full ResNet-18 that table A1 leaves out."""
-
-NORMS = {"trained": False, "frozen": True}
-"""Values of ``model.encoder_norm``: whether batch norm keeps its initial statistics."""
 
 
 class BasicBlock(nn.Module):
@@ -57,13 +53,11 @@ class BasicBlock(nn.Module):
 class ResNet18Encoder(Encoder):
     """ResNet-18 without fc: up to layer3 (``layers=3``, table A1) or to layer4 (``layers=4``, the paper's text).
 
-    ``norm``: batch norm is ``trained``, or ``frozen``: it normalises with the initial statistics, in training too;
-    scale and shift are trained either way. Raises ConfigError for another.
+    ``norm``: see :class:`hudepth.models.Encoder`.
     """
 
     def __init__(self, *, layers: Literal[3, 4] = 3, norm: str = "trained") -> None:
-        super().__init__()
-        self.norm_frozen = choose("model.encoder_norm", norm, NORMS)
+        super().__init__(norm=norm)
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
@@ -98,14 +92,6 @@ class ResNet18Encoder(Encoder):
         if weights not in (None, "none"):
             encoder._load(str(weights))
         return encoder
-
-    def train(self, mode: bool = True) -> ResNet18Encoder:
-        """Switch to training mode, but for batch norm if that is frozen."""
-        super().train(mode)
-        for module in self.modules():
-            if self.norm_frozen and isinstance(module, nn.BatchNorm2d):
-                module.eval()
-        return self
 
     def forward(self, image: Float[Tensor, "b 3 h w"], *, run: Callable[..., Any] = run_stage) -> list[Tensor]:
         """Return the feature maps at 1/2, 1/4, 1/8 and 1/16 of the image's size, and at 1/32 with layer4."""

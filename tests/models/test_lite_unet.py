@@ -169,7 +169,13 @@ def test_up_block(upsample: str) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"context": False, "upsample": "nearest"}, {"output": "bins"}, {"arithmetic": "merged", "recompute": True}],
+    [
+        {},
+        {"context": False, "upsample": "nearest"},
+        {"output": "bins"},
+        {"arithmetic": "merged", "recompute": True},
+        {"encoder_norm": "frozen"},
+    ],
 )
 def test_depth_of_the_images_size_and_gradients_everywhere(options: dict[str, Any]) -> None:
     torch.manual_seed(0)
