@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-import tomllib
 from pathlib import Path
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE / "_site"))
-PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+from hudepth import __version__
+
+sys.path.insert(0, str(Path(__file__).parent / "_site"))
 
 project = "hudepth"
 author = "The hudepth authors"
 project_copyright = author
-release = version = PROJECT["version"]
+release = version = __version__
 
 extensions = [
     "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "option_tables",
@@ -30,7 +29,8 @@ myst_heading_anchors = 3
 # Notebooks
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120
+nb_execution_show_tb = True
+nb_execution_timeout = 600  # of a cell [s]: machines that build it may be busy
 nb_output_stderr = "remove"
 
 # Docstrings
