@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -37,6 +38,15 @@ class Pruned(Exception):  # noqa: N818 - no error
     def __init__(self, message: str, value: float) -> None:
         super().__init__(message)
         self.value = value
+
+
+def first_line(error: BaseException) -> str:
+    """Return what a library's error says in its first line, in at most 200 characters, else the name of its class.
+
+    Addresses in it lose their password.
+    """
+    text = re.sub(r"//[^/@\s]+@", "//", str(error))
+    return next((line for line in text.splitlines() if line.strip()), type(error).__name__)[:200].strip()
 
 
 def did_you_mean(name: str, choices: Iterable[str]) -> str:

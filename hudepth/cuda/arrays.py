@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hudepth.base.console import log
+from hudepth.base.errors import first_line
 from hudepth.cuda import graphs
 
 MOST = 8
@@ -100,5 +101,5 @@ class ArrayGraphs:
             del self._seen[oldest]
 
     def _give_up(self, error: Exception) -> None:
-        log.info("%s is not replayed as a CUDA graph, and slower: %s", self.what, graphs.first_line(error))
+        log.info("%s is not replayed as a CUDA graph, and slower: %s", self.what, first_line(error))
         self.wanted = False

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hudepth.base.console import log
+from hudepth.base.errors import first_line
 from hudepth.cuda import graphs
 
 Tensors = Mapping[str, Tensor]
@@ -56,5 +57,5 @@ class Replayed:
             self._known[key] = _Recorded(static, graphs.record(lambda: function(static)))
         except Exception as error:  # a function may do anything, and works without
             self._failed = True
-            log.info("%s is not replayed as a CUDA graph, and slower: %s", self.what, graphs.first_line(error))
+            log.info("%s is not replayed as a CUDA graph, and slower: %s", self.what, first_line(error))
         return not self._failed

@@ -96,8 +96,3 @@ def host_memory(like: torch.Tensor) -> torch.Tensor:
 def wait() -> None:
     """Wait for the device to finish what this thread launched."""
     torch.cuda.current_stream().synchronize()
-
-
-def first_line(error: Exception) -> str:
-    """Return why a recording failed, in at most 200 characters."""
-    return next((line for line in str(error).splitlines() if line), type(error).__name__)[:200]

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from hudepth.base.console import log
+from hudepth.base.errors import first_line
 from hudepth.cuda import graphs
 
 _UNSEEN = ("on_before_zero_grad", "on_before_backward", "on_after_backward", "on_before_optimizer_step")
@@ -120,7 +121,7 @@ class StepGraphs:
             self._steps[key] = self._record(step, tensors, optimizer)
         except Exception as error:  # networks, losses and callbacks may do anything, and training goes on without
             optimizer.zero_grad()
-            self._give_up(graphs.first_line(error))
+            self._give_up(first_line(error))
             return None
         sizes = ", ".join(f"{name} {' x '.join(map(str, x.shape))}" for name, x in tensors.items())
         log.info("training steps of %s are replayed as a CUDA graph", sizes)

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.errors import CheckpointError, ConfigError, first_line
 from hudepth.base.machine import float32_products
 from hudepth.base.normalise import NormaliseBytes
 from hudepth.cuda import graphs
@@ -196,7 +196,7 @@ def open_exported(
     except ConfigError:  # a package that is not installed
         raise
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        reason = first_line(error)
         message = f"'{path}' cannot be read as a model: it is damaged or of another kind ({reason})."
         raise CheckpointError(message) from error
     return GraphBackend(backend, _read_info(path, text), compute)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hudepth.base.errors import CheckpointError
+from hudepth.base.errors import CheckpointError, first_line
 from hudepth.inference.runtimes import onnx_description, onnx_session, openvino_description, openvino_model
 
 TIMEOUT_S = 25
@@ -106,7 +106,7 @@ def _main(path: str, backend: str, threads: str) -> None:
         returned = [(str(getattr(each, "dtype", "?")), list(getattr(each, "shape", []))) for each in outputs]
         found: dict[str, Any] = {"description": text, "inputs": inputs, "outputs": returned}
     except BaseException as error:  # the libraries have dozens of ways to fail
-        found = {"error": (str(error).strip().splitlines() or [type(error).__name__])[0][:200]}
+        found = {"error": first_line(error)}
     print(f"\n{json.dumps(found)}", flush=True)
     os._exit(0)  # what a library does at its end is of no interest
 

@@ -13,7 +13,7 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
-from hudepth.base.errors import CheckpointError, TrainingError
+from hudepth.base.errors import CheckpointError, TrainingError, first_line
 from hudepth.base.files import written_whole
 from hudepth.models.build import build_network
 from hudepth.runs import bundles, hub
@@ -38,7 +38,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 torch.save(checkpoint, part)
         except (OSError, RuntimeError) as error:
             if not re.search(r"unexpected pos|iostream|file write failed", str(error)):  # torch's for a full disk
-                why = getattr(error, "strerror", None) or _first_line(error)
+                why = getattr(error, "strerror", None) or first_line(error)
             last = f"The previous one is intact: free some space, then resume with hudepth-train resume={folder.parent}"
             if not (folder / LAST).is_file():
                 last = "It is the first one: free some space, then train again."
@@ -123,10 +123,6 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
     return path
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 def read_plain(path: Path) -> dict[str, Any]:
     """Read a file of plain types. Raises CheckpointError, without running code, for anything else."""
     _check_archive(path)
@@ -159,7 +155,7 @@ def _check_archive(path: Path) -> None:
 
 
 def _damaged(path: Path, error: Exception) -> CheckpointError:
-    return CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({_first_line(error)}).")
+    return CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({first_line(error)}).")
 
 
 def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
