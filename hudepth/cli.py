@@ -159,7 +159,7 @@ def _check_groups(arguments: list[str]) -> None:
             choices = name.strip("[]").split(",")
             if not all(_WORD.fullmatch(each.strip()) for each in choices):
                 raise ConfigError(f"{key}: no '{name[:40]}'. Pass one of {', '.join(options_of(key))}.")
-            if name[0] == "[" and key not in ("protocol", *ADDED_GROUPS):
+            if name[0] == "[" and key not in ("protocol", "logger", *ADDED_GROUPS):
                 sweep = f"-m {group}={','.join(choices)}"
                 raise ConfigError(
                     f"{group}: takes one choice, not {name}. Pass {group}={choices[0]}, or sweep: {sweep}."

@@ -215,9 +215,9 @@ def test_what_a_random_split_is_worth_is_what_the_study_found() -> None:
     assert said.groups() == tuple(f"{same[side][0]:.3f}" for side in ("random", "disjoint"))
 
 
-@pytest.mark.parametrize("group", ["data", "protocol", "+sweep"])
+@pytest.mark.parametrize("group", ["data", "protocol", "logger", "+sweep"])
 def test_a_table_lists_every_choice(group: str) -> None:
-    (table,) = re.findall(rf"^\| `{re.escape(group)}=` \|.*\n\|---\|---\|\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
+    (table,) = re.findall(rf"^\| `{re.escape(group)}=` \|.*\n\|(?:---\|)+\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     listed = set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
     assert listed == {path.stem for path in (ROOT / "conf" / group.lstrip("+")).glob("*.yaml")} - {"base"}
 

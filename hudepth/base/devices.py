@@ -111,6 +111,7 @@ def without_known_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*does not have many workers.*")  # reading a store needs none
         warnings.filterwarnings("ignore", ".*exists and is not empty.*")  # the run directory, by design
+        warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")  # epochs are logged, too
         warnings.filterwarnings("ignore", ".*LeafSpec.*")  # between Lightning and torch
         warnings.filterwarnings("ignore", ".*in eval mode at the start.*")  # model.encoder_norm=frozen, by design
         for name in ("lightning.pytorch", "lightning.fabric"):

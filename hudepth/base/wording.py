@@ -108,7 +108,7 @@ def _config_line(error: BaseException, task: str) -> str | None:
     if module not in ("hydra", "omegaconf", "antlr4"):
         return None
     text = str(error)
-    if found := re.search(r"Could not find '([^']+)'", text):
+    if found := re.search(r"Could not (?:find|load) '([^']+)'", text):
         group, _, name = found[1].rpartition("/")
         options = options_of(group)
         if options:

@@ -13,6 +13,7 @@ SURROUNDINGS = (
     "trust", "test", "baselines", "protocol", "paths", "logger", "callbacks.panels", "callbacks.panels_every_n_epochs",
     "cuda_graph", "data.source.camera", "data.root", "data.cache", "data.num_workers", "data.on_device",
     "data.prepare_workers", "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy",
+    "trainer.log_every_n_steps",
 )  # fmt: skip
 """Keys that do not change the trained weights either: paths, hardware, pictures, and how the result is tested."""
 INCIDENTAL = (*LABELS, *SURROUNDINGS)

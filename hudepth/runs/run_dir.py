@@ -7,7 +7,8 @@
       environment.json   versions, git state, device    split.json      ids of each subset
       status.json        running | finished | failed | interrupted
       train.log          metrics.csv  times.csv         checkpoints/best.ckpt, last.ckpt
-      tensorboard/       images/                        test/<protocol>/metrics.json, per_image.csv, panels.png
+      tensorboard/  csv/  wandb/  loggers.json          images/
+      test/<protocol>/metrics.json, per_image.csv, panels.png
       scored.json        each evaluation on test images
 """
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from hudepth.base.console import duration, log
 from hudepth.base.devices import spell_epoch
@@ -22,7 +21,7 @@ from hudepth.data.store import DepthStore
 from hudepth.evaluation.pictures import make_panels
 from hudepth.runs.history import write_history
 from hudepth.training.checkpointing import has_validated
-from hudepth.training.loggers import drop, is_dropped
+from hudepth.training.loggers.run import log_picture
 from hudepth.training.module import loss_name
 from hudepth.viz.panels import draw_panels, save_panels
 
@@ -186,10 +185,5 @@ class PanelPictures(Callback):
             return
         panels = make_panels(pl_module, self.store, self.indices, max_depth_m=self.max_depth_m)
         save_panels(self.folder / f"epoch_{epoch:03d}.png", panels)
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger) and not is_dropped(logger):
-                step, picture = trainer.global_step, draw_panels(panels)
-                try:
-                    logger.experiment.add_image("val/panels", picture, step, dataformats="HWC")
-                except OSError as error:
-                    drop(logger, error)
+        if trainer.loggers:
+            log_picture(trainer.loggers, "val/panels", draw_panels(panels), trainer.global_step)

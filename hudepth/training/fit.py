@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.loggers import Logger
 from torch import nn
 from torch.optim import Adam, AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -22,14 +23,17 @@ from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE
+from hudepth.evaluation.outputs import Metrics
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
 from hudepth.runs.checkpoint import load_checkpoint, read_plain
+from hudepth.runs.results import MODEL
 from hudepth.runs.run import best_checkpoint
 from hudepth.training.initial import Parents, Training, network_before, restore_parents
+from hudepth.training.loggers.run import log_tests, open_loggers
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
 from hudepth.training.options import memory_format
@@ -39,8 +43,16 @@ from hudepth.training.trainer import build_callbacks, build_run_trainer, one_end
 
 def fit(training: Training) -> float | None:
     """Train, test the best checkpoint, and return the best value of the monitored metric."""
+    log.info("run directory: %s", training.path)
+    chosen = {} if training.options.trainer.fast_dev_run else training.options.logger.chosen()
+    resumed = training.overrides is not None
+    # Before anything is prepared, which may take hours, and before random numbers are drawn.
+    with open_loggers(chosen, training.path, training.config, in_sweep=training.alone, resumed=resumed) as loggers:
+        return _fit(training, loggers)
+
+
+def _fit(training: Training, loggers: list[Logger]) -> float | None:
     config, options, path = training.config, training.options, training.path
-    log.info("run directory: %s", path)
     seed_everything(options.seed, verbose=False)
     keep_freed_memory()
     import_trusted(options.trust)
@@ -62,23 +74,31 @@ def fit(training: Training) -> float | None:
         raise ConfigError(f"monitor: no '{options.monitor}'.{hint} Pass one of {', '.join(known)}.")
     callbacks = build_callbacks(config, path, data)
     with without_known_warnings():
-        trainer = build_run_trainer(config, path, callbacks, alone=training.alone)
+        trainer = build_run_trainer(config, path, callbacks, loggers, alone=training.alone)
     check_shares(trainer, subset="validation", pairs=len(data.split.val))
     log_start(trainer, module, data)
     with float32_products(tf32=arithmetic.tf32):
         run_epochs(training, trainer, module, data)
     if options.test and trainer.fast_dev_run:  # type: ignore[attr-defined]  # set by Lightning's connector
         log.info("trainer.fast_dev_run: no checkpoint was written, so nothing is tested")
-    elif options.test and trainer.is_global_zero:  # like hudepth-test does: on one device, in full precision
-        tested = {**config, "trainer": {"accelerator": config["trainer"]["accelerator"]}}
-        checkpoint = load_checkpoint(str(path))
-        before = network_before(training, size=data.size, max_depth_m=data.max_depth_m)
-        score_checkpoint(checkpoint, parse(ScoreOptions, tested), output=path / "test", datamodule=data, before=before)
+    elif options.test and trainer.is_global_zero:
+        results = test_best(training, data)
+        log_tests(loggers, {name: metrics[MODEL] for name, metrics in results.items()}, trainer.global_step)
     best = next(c for c in callbacks if getattr(c, "monitor", None) and hasattr(c, "best_model_score"))
     value = None if best.best_model_score is None else float(best.best_model_score)
     if trainer.is_global_zero and best_checkpoint(path):
         log_end(training, value, epochs=trainer.current_epoch)
     return value
+
+
+def test_best(training: Training, data: DepthDataModule) -> dict[str, Metrics]:
+    """Test the best checkpoint as hudepth-test does, on one device and in full precision; return its results."""
+    config, path = training.config, training.path
+    tested = {**config, "trainer": {"accelerator": config["trainer"]["accelerator"]}}
+    checkpoint = load_checkpoint(str(path))
+    before = network_before(training, size=data.size, max_depth_m=data.max_depth_m)
+    options = parse(ScoreOptions, tested)
+    return score_checkpoint(checkpoint, options, output=path / "test", datamodule=data, before=before)
 
 
 def build_datamodule(training: Training) -> DepthDataModule:

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from hudepth.base.masked import widest_float
 
+Sums = Mapping[tuple[str, ...], Tensor]
+"""By the names of values: the sum of each over images, then the number of images."""
+
 
 class EpochMeans:
     """Means of named values, each the mean over a batch, over all images of an epoch."""
@@ -26,12 +29,22 @@ class EpochMeans:
         sums[:-1].add_(new, alpha=images)
         sums[-1:].add_(images)
 
+    def so_far(self) -> Sums:
+        """Return a copy of the sums, on the device."""
+        return {names: sums.clone() for names, sums in self._sums.items()}
+
     def take(self, reduce: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         """Return the means and begin again; ``reduce`` sums a tensor over processes."""
-        totals: dict[str, Tensor] = {}
-        for names, sums in self._sums.items():
-            summed = reduce(sums.clone())
+        found = means({names: reduce(sums) for names, sums in self.so_far().items()})
+        for sums in self._sums.values():
             sums.zero_()
-            for name, total in zip(names, summed[:-1], strict=True):
-                totals[name] = totals.get(name, 0) + torch.stack([total, summed[-1]])
-        return {name: (total / count).float() for name, (total, count) in totals.items() if count}
+        return found
+
+
+def means(sums: Sums) -> dict[str, Tensor]:
+    """Return the mean of each value."""
+    totals: dict[str, Tensor] = {}
+    for names, values in sums.items():
+        for name, total in zip(names, values[:-1], strict=True):
+            totals[name] = totals.get(name, 0) + torch.stack([total, values[-1]])
+    return {name: (total / count).float() for name, (total, count) in totals.items() if count}

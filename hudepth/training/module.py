@@ -23,7 +23,7 @@ from hudepth.losses.distillation import Distillation
 from hudepth.metrics.collection import validation_metrics, validation_names
 from hudepth.runs import checkpoint as ckpt
 from hudepth.training.averaging import averaged_state
-from hudepth.training.means import EpochMeans
+from hudepth.training.means import EpochMeans, Sums
 from hudepth.training.optim import fit_state
 from hudepth.training.schedules import StepSchedule
 
@@ -84,6 +84,7 @@ class DepthModule(LightningModule):
         self._emptied: list[_Step] = []  # in this epoch
         self._losses = {"train": EpochMeans(), "val": EpochMeans()}
         self._graphs = StepGraphs(wanted=cuda_graph)
+        self.after_check: Callable[[], None] = lambda: None  # called when a check has waited for the device
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Predict unit depth from normalised images."""
@@ -154,6 +155,10 @@ class DepthModule(LightningModule):
         self.log_dict({k: v.float() for k, v in self.val_metrics.compute().items()}, sync_dist=True)
         self.val_metrics.reset()
 
+    def losses_so_far(self) -> Sums:
+        """Return the sums of this epoch's training losses, on the device."""
+        return self._losses["train"].so_far()
+
     def log_losses(self, stage: str) -> None:
         """Log the losses of an epoch, ``train`` or ``val``, unless it was done, as by the callback LogLosses."""
         means = self._losses[stage].take(partial(self.trainer.strategy.reduce, reduce_op="sum"))
@@ -173,7 +178,9 @@ class DepthModule(LightningModule):
     def _check_losses(self) -> None:
         """Check the losses of the steps that were not checked yet, with one transfer from the device if all is well."""
         pending, self._unchecked = self._unchecked, []
-        if not pending or not bool(torch.stack([~step.total.isfinite() | step.emptied for step in pending]).any()):
+        odd = pending and bool(torch.stack([~step.total.isfinite() | step.emptied for step in pending]).any())
+        self.after_check()
+        if not odd:
             return
         if bad := next((step for step in pending if not bool(step.total.isfinite())), None):
             raise TrainingError(

@@ -14,6 +14,7 @@ from hudepth.base.errors import ConfigError
 from hudepth.base.machine import Arithmetic
 from hudepth.base.options import Range, parse
 from hudepth.data.sources.pairing import printable
+from hudepth.training.loggers.kinds import KINDS, Known, check_installed
 
 MEMORY_FORMATS = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
 
@@ -43,6 +44,8 @@ class TrainerOptions:
     limit_val_batches: _Share = None
     limit_test_batches: _Share = None
     check_val_every_n_epoch: Annotated[int, Range(1)] | None = 1
+    log_every_n_steps: Annotated[int, Range(0)] = 50
+    fast_dev_run: bool | int = False
 
     def __post_init__(self) -> None:
         if self.precision.startswith("64"):
@@ -68,10 +71,25 @@ class CallbackOptions:
 
 @dataclass(frozen=True)
 class LoggerOptions:
-    """Loggers in addition to metrics.csv."""
+    """Options of each logger in addition to metrics.csv; None: not used."""
 
-    tensorboard: bool = True
+    tensorboard: dict[str, Any] | bool | None = None
+    """A switch in the configurations of older runs."""
+    csv: dict[str, Any] | None = None
+    wandb: dict[str, Any] | None = None
+    mlflow: dict[str, Any] | None = None
+    comet: dict[str, Any] | None = None
     extra: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for kind, options in self.chosen().items():
+            parse(Known, options, prefix=f"logger.{kind}.")
+            check_installed(kind)
+
+    def chosen(self) -> dict[str, dict[str, Any]]:
+        """Return the options of each kind of logger that is used."""
+        found = {kind: getattr(self, kind) for kind in KINDS}
+        return {kind: {} if x is True else x for kind, x in found.items() if x is not None and x is not False}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger
 
 from hudepth.base.console import shows_progress
 from hudepth.base.devices import ProgressBar, build_trainer
@@ -24,7 +24,7 @@ from hudepth.runs import history
 from hudepth.runs.checkpoint import AtomicCheckpointIO
 from hudepth.training.callbacks import CompileTime, EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
 from hudepth.training.checkpointing import FullSizeEarlyStopping, checkpoint_callbacks
-from hudepth.training.loggers import drop_on_failure
+from hudepth.training.loggers.steps import LogSteps
 from hudepth.training.study import TRIAL_ENV, TrialPruner
 from hudepth.training.times import Times
 
@@ -34,7 +34,7 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
     options, monitor, mode = config["callbacks"], config["monitor"], config["mode"]
     callbacks: list[Callback] = [
         Interrupt(), EpochSeed(config["seed"]), LogLosses(), History(path / history.FILE), Times(path / "times.csv"),
-        EpochLine(monitor),
+        EpochLine(monitor), LogSteps(),
     ]  # fmt: skip
     if config.get("compile"):
         callbacks.append(CompileTime())
@@ -52,17 +52,13 @@ def build_callbacks(config: Mapping[str, Any], path: Path, datamodule: DepthData
     return [*callbacks, *checkpoint_callbacks(path, monitor=monitor, mode=mode)]
 
 
-def build_run_trainer(config: Mapping[str, Any], path: Path, callbacks: list[Callback], *, alone: bool) -> Trainer:
+def build_run_trainer(
+    config: Mapping[str, Any], path: Path, callbacks: list[Callback], loggers: list[Logger], *, alone: bool
+) -> Trainer:
     """Build the Trainer of a run; ``alone`` means one process, whatever cluster it runs on."""
-    options = config["logger"]
-    loggers: list[Logger] = [instantiate(extra, trust=config["trust"], only=Logger) for extra in options["extra"]]
-    if options["tensorboard"]:
-        loggers.append(TensorBoardLogger(path, name="tensorboard", version=""))
-    loggers = [drop_on_failure(logger) for logger in loggers]
     defaults = {
         "enable_model_summary": False, "enable_progress_bar": shows_progress(), "num_sanity_val_steps": 0,
         "benchmark": not config["trainer"].get("deterministic"),  # cuDNN tries its algorithms: sizes hardly change
-        "log_every_n_steps": 1,  # everything is logged per epoch; a larger number only makes Lightning warn
     }  # fmt: skip
     return build_trainer(
         {**defaults, **config["trainer"]}, logger=loggers or False, callbacks=callbacks,

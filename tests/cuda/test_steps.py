@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import CSVLogger
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -24,6 +25,7 @@ from hudepth.losses import BADCL
 from hudepth.models import TinyUNet
 from hudepth.training.averaging import EMA
 from hudepth.training.callbacks import History, LogLosses
+from hudepth.training.loggers.steps import LogSteps
 from hudepth.training.module import DepthModule
 from hudepth.training.schedules import StepSchedule
 from tests.devices import with_graphs
@@ -68,9 +70,9 @@ def train(
     )  # fmt: skip
     rates, history = Rates(), History(cache / "metrics.csv")
     trainer = Trainer(
-        accelerator="cpu", enable_model_summary=False, enable_progress_bar=False, num_sanity_val_steps=0, logger=False,
+        accelerator="cpu", enable_model_summary=False, enable_progress_bar=False, num_sanity_val_steps=0,
         enable_checkpointing=False, callbacks=[LogLosses(), history, rates, *callbacks],
-        **{"max_epochs": 2, **options},
+        **{"max_epochs": 2, "logger": False, **options},
     )  # fmt: skip
     trainer.fit(module, datamodule=data)
     return module, trainer, rates, history
@@ -130,6 +132,17 @@ def test_replayed_steps_are_the_usual_ones(
     assert all(type(rate) is float for rate in also_seen.rates)
     assert also_seen.losses == seen.losses
     assert other_history.rows == history.rows
+
+
+def test_losses_of_replayed_steps_are_logged(cache: Path, tmp_path: Path, replays: list[None]) -> None:
+    options: dict[str, Any] = {"log_every_n_steps": 2, "scheduler": halved}
+    train(cache, LogSteps(), logger=CSVLogger(tmp_path, name="usual", version=""), **options)
+    with with_graphs():
+        train(cache, LogSteps(), logger=CSVLogger(tmp_path, name="replayed", version=""), **options)
+    assert replays
+    usual, replayed = ((tmp_path / name / "metrics.csv").read_text() for name in ("usual", "replayed"))
+    assert replayed == usual
+    assert "train/loss/total_step" in usual
 
 
 def test_the_schedule_reaches_replayed_steps(cache: Path, replays: list[None]) -> None:

@@ -8,7 +8,7 @@ import pytest
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from hudepth.base.console import log
-from hudepth.training.loggers import drop_on_failure, is_dropped
+from hudepth.training.loggers.guard import drop_on_failure, is_dropped
 
 
 class Full(CSVLogger):
