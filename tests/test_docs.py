@@ -94,7 +94,8 @@ def shortened(command: str) -> list[str]:
         return words
     rooms = [] if "data=" in command else ["data.source.scenes=6", "data.source.size=[48,64]"]
     weights = ["model.weights=none"] if re.search("experiment=(badcl|strong|pretrain)", command) else []
-    return [w for w in words if not w.startswith("trainer.max_epochs")] + SMALL + rooms + weights
+    small = [word for word in SMALL if word != "logger=none" or "logger=" not in command]
+    return [w for w in words if not w.startswith("trainer.max_epochs")] + small + rooms + weights
 
 
 def check_demo(words: list[str], folder: Path) -> None:

@@ -23,8 +23,8 @@ from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE
-from hudepth.evaluation.outputs import Metrics
 from hudepth.evaluation.protocols import build_protocols
+from hudepth.evaluation.results_table import Metrics
 from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
