@@ -342,7 +342,7 @@ def test_a_run_directory_does_not_vouch_for_its_own_classes(command: Command, tr
     "options",
     [
         ("+trainer.fast_dev_run=true",),
-        ("+trainer.enable_progress_bar=false", "+trainer.num_sanity_val_steps=2", "+trainer.log_every_n_steps=10"),
+        ("+trainer.enable_progress_bar=false", "+trainer.num_sanity_val_steps=2", "trainer.log_every_n_steps=10"),
         ("+trainer.check_val_every_n_epoch=2", "callbacks=early_stopping", "trainer.max_epochs=5"),
     ],
 )
