@@ -78,3 +78,18 @@ class TransformerBlock(nn.Module):
         tokens = self.norm1(tokens + self.attention(queries, queries, tokens, need_weights=False)[0])
         tokens = self.norm2(tokens + self.feed_forward(tokens))
         return tokens.transpose(1, 2).reshape(x.shape)
+
+
+class PooledContext(nn.Module):
+    """Adds to each position what the mean over all says: depth depends on the whole scene (as in ParseNet, 2015)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(channels, channels // 2, 1), nn.ReLU(inplace=True), nn.Conv2d(channels // 2, channels, 1)
+        )
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Return a map of the same shape."""
+        result: Tensor = x + self.layers(x.mean(dim=(2, 3), keepdim=True))
+        return result

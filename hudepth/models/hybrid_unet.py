@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from hudepth.models.attention import TransformerBlock
+from hudepth.models.attention import PooledContext, TransformerBlock
 from hudepth.models.decoder import Arithmetic, UpsampleMode
 from hudepth.models.options import choose
 from hudepth.models.resnet import ResNet18Encoder
@@ -32,6 +32,7 @@ class HybridUNet(UNet):
         arithmetic: ``plain``, or ``merged``: linear steps as one, with a fifth fewer multiplications and the same
             results up to rounding (:mod:`hudepth.models.decoder`).
         encoder_norm: batch norm of the encoder: ``trained``, or ``frozen`` to its initial statistics.
+        context: the mean of the deepest map joins each of its positions (:class:`PooledContext`); not of the paper.
 
     Raises:
         ConfigError: for an unknown option.
@@ -40,6 +41,7 @@ class HybridUNet(UNet):
 
     attention_skip: nn.Module
     attention_deepest: nn.Module
+    context: nn.Module
 
     def __init__(
         self,
@@ -54,6 +56,7 @@ class HybridUNet(UNet):
         arithmetic: Arithmetic = "plain",
         encoder_norm: str = "trained",
         recompute: bool = False,
+        context: bool = False,
     ) -> None:
         on_skip, on_deepest = choose("model.attention", attention, ATTENTION)
         encoder = ResNet18Encoder.from_pretrained(weights, norm=encoder_norm)
@@ -65,6 +68,7 @@ class HybridUNet(UNet):
             encoder,
             attention_skip=block(skip.channels) if on_skip else nn.Identity(),
             attention_deepest=block(deepest.channels) if on_deepest else nn.Identity(),
+            context=PooledContext(deepest.channels) if context else nn.Identity(),
             upsample=upsample,
             output=output,
             arithmetic=arithmetic,
@@ -74,5 +78,5 @@ class HybridUNet(UNet):
     def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:
         """Apply the transformer blocks to the two deepest maps."""
         *fine, skip, deepest = features
-        deepest = run(self.attention_deepest, deepest)
+        deepest = self.context(run(self.attention_deepest, deepest))
         return [*fine, run(self.attention_skip, skip), deepest]

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hudepth.base.options import convert
+from hudepth.models.attention import PooledContext
 from hudepth.models.decoder import Arithmetic, UpsampleMode
 from hudepth.models.efficientnet import EfficientNetLite0Encoder
 from hudepth.models.unet import UNet
@@ -46,21 +47,6 @@ class LiteUpBlock(nn.Module):
         x = functional.interpolate(self.coarse(x), scale_factor=2.0, mode=self.upsample, **align)
         x = functional.relu(x + self.skip(skip))
         return functional.relu(x + self.residual(x))
-
-
-class PooledContext(nn.Module):
-    """Adds to each position what the mean over all says: depth depends on the whole scene (as in ParseNet, 2015)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Conv2d(channels, channels // 2, 1), nn.ReLU(inplace=True), nn.Conv2d(channels // 2, channels, 1)
-        )
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return a map of the same shape."""
-        result: Tensor = x + self.layers(x.mean(dim=(2, 3), keepdim=True))
-        return result
 
 
 class LiteUNet(UNet):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
+from hudepth.base.verbs import conf_folder
 from hudepth.models import HybridUNet
 
 # Every row of table A1 with a shape: (module here, output without the batch, parameters or None where it states none).
@@ -416,3 +417,27 @@ def test_a_network_without_numbers_knows_its_shapes(arithmetic: str) -> None:
     with torch.device("meta"):
         net = HybridUNet(arithmetic=arithmetic)
         assert net(torch.empty(2, 3, 32, 48)).shape == (2, 1, 32, 48)
+
+
+def test_context_adds_what_the_mean_of_the_deepest_map_says() -> None:
+    """With an independent computation of it, in place of the module; table A1 has none."""
+    torch.manual_seed(0)
+    net, without = HybridUNet(context=True).eval(), HybridUNet().eval()
+    added = sum(parameter.numel() for parameter in net.context.parameters())
+    assert added == 256 * 128 + 128 + 128 * 256 + 256
+    assert "65,920 parameters more" in (conf_folder() / "model" / "hybrid_unet.yaml").read_text()
+    assert added == 65_920
+    without.load_state_dict(net.state_dict(), strict=False)
+    first, _, second = net.context.layers
+    weights = [(layer.weight[:, :, 0, 0], layer.bias) for layer in (first, second)]
+
+    def context(x: Tensor) -> Tensor:
+        mean = x.flatten(2).mean(2)
+        hidden = (mean @ weights[0][0].T + weights[0][1]).clamp(min=0)
+        return x + (hidden @ weights[1][0].T + weights[1][1])[:, :, None, None]
+
+    image = torch.randn(2, 3, 32, 48)
+    plain = without(image)
+    without.context.forward = context  # type: ignore[method-assign]
+    torch.testing.assert_close(net(image), without(image))
+    assert not torch.equal(plain, without(image))
