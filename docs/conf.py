@@ -20,8 +20,9 @@ extensions = [
 ]  # fmt: skip
 exclude_patterns = ["README.md", "_site"]
 nitpicky = True
-# the inventories of other projects are on the network; every name of hudepth must be found
-nitpick_ignore_regex = [("py:.*", r"(?!hudepth\b).*")]
+# the inventories of other projects are on the network; every other name must be found
+EXTERNAL = r"(abc|collections|jaxtyping|lightning|numpy|pathlib|PIL|re|torch|torchmetrics)\..*|Figure|Tensor|ndarray"
+nitpick_ignore_regex = [("py:.*", EXTERNAL)]
 
 # Markdown
 myst_heading_anchors = 3
@@ -32,6 +33,7 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_execution_timeout = 600  # of a cell [s]: machines that build it may be busy
 nb_output_stderr = "remove"
+nb_merge_streams = True
 
 # Docstrings
 autodoc_member_order = "bysource"
@@ -42,6 +44,7 @@ add_module_names = False
 toc_object_entries_show_parents = "hide"
 
 # Pages
+highlight_language = "none"
 html_theme = "pydata_sphinx_theme"
 html_title = "hudepth"
 html_static_path = ["_site/static"]
@@ -49,6 +52,7 @@ templates_path = ["_site/templates"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
+html_context = {"default_mode": "auto"}
 html_sidebars = {"**": ["all-pages"]}
 html_theme_options = {
     "navbar_center": [],

@@ -59,6 +59,7 @@ def read(path: Path) -> Configuration:
             continue
         found = LINE.fullmatch(line)
         if not found:
+            waiting = []
             continue  # an entry of a list, or empty
         indent, key, value = len(found["indent"]), found["key"], found["value"] or ""
         parents = [parent for parent in parents if parent[0] < indent]

@@ -50,7 +50,7 @@ class StepGraphs:
 
     def __init__(self, *, wanted: bool = True) -> None:
         self.wanted = self._asked = wanted
-        self.mode: Literal["usual", "record", "replay"] = "usual"
+        self.mode: Literal["usual", "record", "replay"] = "usual"  #: how the next step is run
         self.clear()
 
     def start(self, trainer: Trainer) -> None:

@@ -93,7 +93,7 @@ class Augmentation:
         """Draw all random numbers for ``count`` images, from a generator of the CPU: the same ones on every device.
 
         Returns:
-            ``numbers`` [n, count], uniform in [0, 1), and if there is noise, ``noise`` [count, 3, *size], normal.
+            ``numbers`` [n, count], uniform in [0, 1), and if there is noise, ``noise`` ``[count, 3, *size]``, normal.
         """
         draws = {"numbers": copy_to(torch.rand(_DRAWS, count, generator=generator), device)}
         if self.noise:

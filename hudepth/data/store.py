@@ -191,7 +191,7 @@ class DepthStore:
                 if (file.attrs.get("format"), file.attrs.get("version")) != (FORMAT, VERSION):
                     raise DataError(f"'{self.path}' is not a depth store of version {VERSION}. {_AGAIN}")
                 self.info: dict[str, Any] = dict(json.loads(file.attrs["info"]))
-                self.per_m = int(file.attrs.get("per_metre", MM_PER_M))  # stored depths are so many to the metre
+                self.per_m = int(file.attrs.get("per_metre", MM_PER_M))  #: stored depths are so many to the metre
                 self.records, self.size, self.has_native = _read_layout(file)
             if self.per_m not in SCALES:
                 raise ValueError(f"per_metre is {self.per_m}")

@@ -46,6 +46,7 @@ STRATA: tuple[tuple[str, str], ...] = (
 STRATUM_SUMS = ("count", "abs_rel", "squared", "absolute", "delta1")
 """Columns of :func:`strata_sums`; the first is in pixels."""
 MAX_CATEGORIES = 12
+"""Scene categories that are listed by name."""
 _SIZES = (len(DEPTH_EDGES_M) + 1, len(EDGE_DISTANCES_PX) + 1, 9)
 """Bins of each group."""
 _CELLS = math.prod(_SIZES)
