@@ -1,4 +1,4 @@
-"""The transformer block of section 3.1 and figure 4, over the positions of a feature map."""
+"""What positions of a map know of each other: the transformer block (section 3.1, figure 4), and pooled context."""
 
 from __future__ import annotations
 
