@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from lightning.pytorch.loggers import CometLogger, CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from hudepth.base.console import log
@@ -97,16 +98,14 @@ def _mlflow(options: Options, place: Place) -> Logger:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")  # minutes each time, and the training waits
     default = f"sqlite:///{(place.runs / STORE).as_posix()}"
     uri = options.pop("tracking_uri", None) or os.environ.get("MLFLOW_TRACKING_URI") or default
-    if uri == default:
-        place.runs.mkdir(parents=True, exist_ok=True)
-    local = Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
-    pictures = {} if local is None else {"artifact_location": (local.absolute().parent / "mlartifacts").as_uri()}
+    local = Path(uri.removeprefix("sqlite:///")).absolute() if uri.startswith("sqlite:///") else None
+    pictures = {} if local is None else {"artifact_location": (local.parent / "mlartifacts").as_uri()}
     about = {"run_name": place.name, "tags": {"sweep": place.sweep} if place.sweep else None, "run_id": place.known}
-    logger = MLFlowLogger(**{**about, **pictures, **options}, tracking_uri=uri)
     page = re.sub("//[^/]*@", "//", uri)  # without a password
     try:
-        with _environment():  # MLflow would leave its address there, for other runs of this process
-            client, run = logger.experiment, logger.run_id
+        with _locked(local), _environment():  # MLflow leaves its address there, for other runs of this process
+            logger = MLFlowLogger(**{**about, **pictures, **options}, tracking_uri=uri)
+            client, run = _begin(logger), logger.run_id
     except mlflow.MlflowException as error:
         if "Max retries" not in str(error):
             raise
@@ -117,6 +116,29 @@ def _mlflow(options: Options, place: Place) -> Logger:
     where = f"mlflow ui --backend-store-uri {uri}" if local else f"{page}/#/experiments/{logger.experiment_id}"
     log.info("mlflow: %s, run %s", where, run)
     return logger
+
+
+@contextmanager
+def _locked(store: Path | None) -> Iterator[None]:
+    """Let the jobs of a sweep open a data base one after another: MLflow cannot make its tables twice at once."""
+    if store is None:
+        yield
+        return
+    store.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(store.with_name(f".{store.name}.lock")):
+        yield
+
+
+def _begin(logger: MLFlowLogger) -> Any:
+    """Begin a run, in an experiment that is made unless there is one; return the client."""
+    from mlflow import MlflowException
+
+    try:
+        return logger.experiment
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_ALREADY_EXISTS":
+            raise
+        return logger.experiment  # another job of the sweep was faster
 
 
 def _comet(options: Options, place: Place) -> Logger:

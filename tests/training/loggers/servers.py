@@ -68,6 +68,21 @@ def mlflow_until_metrics(path: str, body: dict[str, Any]) -> tuple[int, dict[str
     return None
 
 
+def mlflow_of_a_faster_job() -> Answer:
+    """Answer as MLflow where another job makes the experiment after this one looked for it."""
+    looked: list[str] = []
+
+    def answer(path: str, body: dict[str, Any]) -> tuple[int, dict[str, Any]] | None:
+        if "experiments/get-by-name" in path and not looked:
+            looked.append(path)
+            return 404, {"error_code": "RESOURCE_DOES_NOT_EXIST", "message": "no such experiment"}
+        if path.endswith("experiments/create"):
+            return 400, {"error_code": "RESOURCE_ALREADY_EXISTS", "message": "there is one"}
+        return mlflow_until_metrics(path, body) or (200, {})
+
+    return answer
+
+
 def wandb_until_values(path: str, body: dict[str, Any]) -> tuple[int, dict[str, Any]] | None:
     """Answer as Weights & Biases until the first values arrive."""
     query = str(body.get("query", ""))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from hudepth.training.loggers import kinds
 from hudepth.training.loggers.run import open_loggers
 from tests.commands import TINY, Command
 from tests.training.loggers.readers import read_comet, read_csv, read_mlflow, read_tensorboard, read_wandb
-from tests.training.loggers.servers import mlflow_until_metrics, serving, wandb_until_values
+from tests.training.loggers.servers import mlflow_of_a_faster_job, mlflow_until_metrics, serving, wandb_until_values
 from tests.training.loggers.test_run import OFFLINE, ids, train
 
 QUICK = (*TINY, "test=false", "trainer.log_every_n_steps=2")
@@ -35,6 +38,17 @@ def test_a_package_that_is_missing(kind: str, command: Command, monkeypatch: pyt
     assert done.code == 1
     assert last_line(done.err) == (f"logger={kind}: its package is not installed. Run pip install 'hudepth[{kind}]'.")
     assert not Path("runs").exists()
+
+
+@pytest.mark.slow
+def test_nothing_is_imported_that_was_not_chosen(tmp_path: Path, cache: Path) -> None:
+    code = "import sys; from hudepth import cli; assert cli.train() == 0; print(*sorted(sys.modules))"
+    words = [sys.executable, "-c", code, *QUICK, "logger=[tensorboard,csv]"]
+    environment = {**os.environ, "HUDEPTH_CACHE": str(cache)}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, text=True, capture_output=True, check=True)
+    imported = set(done.stdout.splitlines()[-1].split())
+    assert "lightning.pytorch.loggers.wandb" in imported
+    assert not {"wandb", "mlflow", "comet_ml"} & imported
 
 
 @pytest.mark.parametrize("choice", ["wandbb", "[csv,wandbb]"])
@@ -138,14 +152,14 @@ def test_a_run_of_an_earlier_version_resumes(trained: Path, command: Command) ->
 
 @pytest.mark.slow
 def test_jobs_of_a_sweep_are_runs_of_their_own(tmp_path: Path, cache: Path) -> None:
-    """In one process: neither service takes the second job for the first."""
+    """Three in two processes: two make MLflow's data base at once, and the third is not taken for the one before it."""
     train(
-        "-m", *QUICK, *OFFLINE, "logger=[wandb,mlflow,comet]", "seed=1,2", "name=pair", "trainer.max_epochs=1",
-        folder=tmp_path, cache=cache,
+        "-m", *QUICK, *OFFLINE, "logger=[wandb,mlflow,comet]", "seed=1,2,3", "name=pair", "trainer.max_epochs=1",
+        "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", folder=tmp_path, cache=cache,
     )  # fmt: skip
     (sweep,) = (tmp_path / "sweeps" / "pair").iterdir()
     jobs = [path for path in sweep.iterdir() if path.is_dir()]
-    assert len({ids(job)[kind] for job in jobs for kind in ("wandb", "mlflow", "comet")}) == 6
+    assert len({ids(job)[kind] for job in jobs for kind in ("wandb", "mlflow", "comet")}) == 9
     for job in jobs:
         wandb, comet = read_wandb(job), read_comet(job)
         mlflow = read_mlflow(f"sqlite:///{tmp_path}/runs/mlflow.db", ids(job)["mlflow"])
@@ -220,6 +234,14 @@ def test_a_damaged_file_of_names_begins_another_run(written: str, runs: Path, ru
     with open_loggers({"mlflow": {}}, run, configuration(runs), in_sweep=False, resumed=True):
         pass
     assert len(ids(run)["mlflow"]) == 32
+
+
+def test_an_experiment_that_another_job_made_meanwhile(runs: Path, run: Path) -> None:
+    with serving(mlflow_of_a_faster_job()) as address:
+        options = {"mlflow": {"tracking_uri": address}}
+        with open_loggers(options, run, configuration(runs), in_sweep=False, resumed=False):
+            pass
+    assert ids(run)["mlflow"] == "abc"
 
 
 def test_a_run_that_the_service_has_lost_says_how_to_begin_another(runs: Path, run: Path) -> None:
