@@ -5,7 +5,7 @@ INSTALLED := .venv/.installed
 # each test process would compile every module again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install demo test test-all test-gpu lint docs ledger format clean
+.PHONY: help install demo test test-all test-gpu lint docs ledger format lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -45,6 +45,10 @@ ledger: $(INSTALLED)  ## check every claim of the paper; ARGS="--runs DIR ..." a
 format: $(INSTALLED)  ## format the code
 	$(BIN)/ruff check --fix --exit-zero .
 	$(BIN)/ruff format .
+
+lock:  ## write uv.lock with the versions of constraints.txt; needs uv
+	uv lock --no-config --default-index https://pypi.org/simple \
+	  $$(sed -n 's/^\([A-Za-z].*\)/--upgrade-package \1/p' constraints.txt)
 
 clean:  ## remove .venv, caches and build results; runs stay
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

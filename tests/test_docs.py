@@ -225,7 +225,7 @@ def test_a_table_lists_every_choice(group: str) -> None:
 
 def test_make_help_lists_every_target() -> None:
     done = subprocess.run(["make", "help"], cwd=ROOT, text=True, capture_output=True, check=True)
-    for target in ("help", "install", "demo", "test", "test-all", "lint", "docs", "ledger", "format", "clean"):
+    for target in ("help", "install", "demo", "test", "test-all", "lint", "docs", "ledger", "format", "lock", "clean"):
         assert re.search(rf"^{target}\s+\w", done.stdout, re.MULTILINE)
 
 
