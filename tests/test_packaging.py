@@ -7,8 +7,14 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
 
+import numpy as np
 import pytest
+from PIL import Image
+
+from tests.commands import TINY
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ("hudepth/", "conf/", "experiments/strong_official/nyu/", "pyproject", "README", "LICENSE")
@@ -49,19 +55,51 @@ def test_the_wheel_brings_a_model(site: Path) -> None:
     assert (site / "hudepth" / "pretrained" / "nyu" / "model.safetensors").stat().st_size < 10_000_000
 
 
-def test_the_wheel_runs_from_anywhere(site: Path, tmp_path: Path) -> None:
-    code = "import hudepth, sys; from hudepth import cli; assert sys.argv[1] in hudepth.__file__; sys.argv[1:] = ['experiment=badcl', '--cfg', 'job']; sys.exit(cli.train())"  # noqa: E501
-    environment = {**os.environ, "PYTHONPATH": str(site)}
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(site)],
-        cwd=tmp_path,
-        env=environment,
-        text=True,
-        capture_output=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "max_epochs: 100" in done.stdout
+def wheel_command(site: Path, task: str, *arguments: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start a console script of the unpacked wheel, which is not that of this repository."""
+    code = f"import sys; from hudepth import cli; assert {str(site)!r} in cli.__file__; sys.exit(cli.{task}())"
+    environment = {**os.environ, "PYTHONPATH": str(site), "HUDEPTH_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=cwd, env=environment, **pipes)
+
+
+def run_wheel(site: Path, task: str, *arguments: str, cwd: Path) -> str:
+    process = wheel_command(site, task, *arguments, cwd=cwd)
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, output
+    return output
+
+
+def test_the_wheel_composes_from_anywhere(site: Path, tmp_path: Path) -> None:
+    assert "max_epochs: 100" in run_wheel(site, "train", "experiment=badcl", "--cfg", "job", cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_wheel_trains_predicts_and_reports_from_anywhere(site: Path, tmp_path: Path) -> None:
+    run_wheel(site, "train", "experiment=demo", *TINY, cwd=tmp_path)
+    Image.new("RGB", (64, 48), (200, 120, 40)).save(tmp_path / "photo.png")
+    for checkpoint in ("nyu", "last"):
+        said = run_wheel(
+            site, "predict", f"checkpoint={checkpoint}", "input=photo.png", f"output={checkpoint}", cwd=tmp_path
+        )
+        assert "1 predicted" in said
+        assert np.load(tmp_path / checkpoint / "photo_depth.npy").shape == (48, 64)
+    run_wheel(site, "report", "figures", "run=last", cwd=tmp_path)
+    assert len(list(tmp_path.glob("runs/demo/*/figures/*.png"))) == 2
+
+
+@pytest.mark.slow
+def test_the_wheel_serves_the_page_from_anywhere(site: Path, tmp_path: Path) -> None:
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    process = wheel_command(site, "demo", "port=0", cwd=tmp_path)
+    assert process.stdout is not None
+    try:
+        address = next(found[0] for line in process.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+", line)))
+        with urlopen(address, timeout=30) as page:
+            assert b"hudepth" in page.read()
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version() -> None:
