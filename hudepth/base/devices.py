@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Trainer
-from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
+from lightning.pytorch.accelerators import AcceleratorRegistry, CUDAAccelerator, MPSAccelerator
 from lightning.pytorch.callbacks import RichProgressBar
+from lightning.pytorch.strategies import StrategyRegistry
 from lightning.pytorch.utilities import rank_zero_only
 
-from hudepth.base.errors import ConfigError
+from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.machine import resolve_precision
+from hudepth.base.options import Choice, Range, convert
 
 GPUS = {
     "gpu": (CUDAAccelerator, MPSAccelerator),
@@ -25,6 +28,18 @@ GPUS = {
 """Accelerators that a machine may lack, and their implementations."""
 
 
+_STRATEGIES = ("auto", *StrategyRegistry.available_strategies())
+_PRECISIONS = (
+    "tf32", "fast", "32-true", "bf16-mixed", "16-mixed", "32", "16", "bf16", "bf16-true", "16-true", "64-true", "64",
+    "transformer-engine", "transformer-engine-float16",
+)  # fmt: skip
+_KINDS = {
+    "accelerator": Annotated[str, Choice(("auto", "gpu", *sorted(AcceleratorRegistry.available_accelerators())))],
+    "devices": Annotated[int, Range(1)] | Literal["auto", -1],
+    "strategy": Annotated[str, Choice(_STRATEGIES), "a strategy, as auto or ddp"],
+    "precision": Annotated[str, Choice(_PRECISIONS), "a precision, as tf32, fast, 32-true, bf16-mixed or 16-mixed"],
+}
+"""Types of arguments of Lightning's Trainer."""
 _SET_HERE = {"logger", "callbacks", "plugins", "default_root_dir", "use_distributed_sampler"}
 
 
@@ -51,8 +66,14 @@ def check_devices(options: Mapping[str, Any]) -> None:
         options: the ``trainer`` part of a configuration.
 
     Raises:
-        ConfigError: for a GPU where there is none, or synchronised batch norm without one.
+        ConfigError: for names that do not exist, a GPU where there is none, or synchronised batch norm without one.
     """
+    if unknown := [key for key in options if key not in inspect.signature(Trainer).parameters]:
+        hint = did_you_mean(unknown[0], inspect.signature(Trainer).parameters)
+        raise ConfigError(f"trainer.{unknown[0]}: lightning.Trainer has no such argument.{hint or ' Leave it out.'}")
+    for key, kind in _KINDS.items():
+        if not isinstance(options.get(key), list | None):
+            convert(f"trainer.{key}", options[key], kind)
     if taken := sorted(_SET_HERE & options.keys()):
         raise ConfigError(f"trainer.{taken[0]} is set by hudepth. See logger= and callbacks= for your own.")
     accelerator = str(options.get("accelerator", "auto"))

@@ -15,6 +15,14 @@ class ConfigError(HudepthError):
     """A configuration that cannot be run."""
 
 
+class OptionError(ConfigError):
+    """A value that does not fit its option; ``key`` is the option's name."""
+
+    def __init__(self, message: str, key: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
 class DataError(HudepthError):
     """A data set, a file in it, or a split that cannot be used."""
 

@@ -11,10 +11,10 @@ import importlib
 import inspect
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 from hudepth.base.errors import ConfigError, HudepthError, did_you_mean
-from hudepth.base.options import convert
+from hudepth.base.options import Range, convert
 
 TRUSTED = (
     "hudepth.", "torch.nn.modules.loss.", "torch.optim.", "lightning.pytorch.loggers.", "lightning.pytorch.callbacks.",
@@ -23,6 +23,8 @@ TRUSTED = (
 would never be built."""
 _NUMBER = {"bool", "int", "float", "None", "Optional", "Union", "typing", "Tensor", "torch"}
 """Words of the annotation of an argument that is a number or a switch."""
+_NOT_NEGATIVE = {"lr", "weight_decay", "momentum", "eps"}
+"""Arguments of PyTorch's optimisers, which refuse negative ones without saying whose they are."""
 _IMPORTED = ("torch.nn.",)
 """Prefixes under which classes of :data:`TRUSTED` are usually named: torch.nn.L1Loss."""
 
@@ -62,7 +64,8 @@ def _check_numbers(target: type, config: Mapping[str, Any], key: str) -> None:
         kind = next((each for each in (float, int, bool) if each.__name__ in words), None)
         left_out = config[name] is None and words & {"None", "Optional"}
         if kind and words <= _NUMBER and not left_out:
-            convert(f"{key}.{name}", config[name], kind)
+            hint: Any = Annotated[kind, Range(0)] if name in _NOT_NEGATIVE else kind
+            convert(f"{key}.{name}", config[name], hint)
 
 
 def find_class(target: str, *, trust: Iterable[str] = ()) -> type:

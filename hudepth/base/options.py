@@ -14,7 +14,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, OptionError, did_you_mean
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -113,9 +113,9 @@ def convert(key: str, value: Any, hint: Any, *, default: Any = MISSING) -> Any:
         return _convert(key, value, hint, ())
     except _MismatchError as error:
         fix = did_you_mean(error.args[0], map(str, _choices(hint))) if error.args else ""
-        if default is not MISSING:
-            fix += f" Leave {key} out for {'the default' if default is None else _show(default)}."
-        raise ConfigError(f"{key}: {_show(value)} is not {_describe(hint)}.{fix}") from None
+        if default is not MISSING and default is not None:
+            fix += f" Leave {key} out for {_show(default)}."
+        raise OptionError(f"{key}: {_show(value)} is not {_describe(hint)}.{fix}", key) from None
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _describe(hint: Any, bounds: str = "") -> str:
         return f"a list of {f'{len(args)} ' if origin is tuple else ''}{inner}"
     if hint is int or hint is float:
         return f"a {'whole ' if hint is int else ''}number{bounds}"
-    return {bool: "true or false", str: "text", Path: "a path"}.get(hint, "a group of options")
+    return {bool: "true or false", str: "text", Path: "a path"}.get(hint, "a mapping of options")
 
 
 def _show(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import sys
@@ -10,7 +11,7 @@ import traceback
 from collections.abc import Iterator
 from typing import Any
 
-from hudepth.base.errors import HudepthError, did_you_mean
+from hudepth.base.errors import HudepthError, OptionError, did_you_mean
 from hudepth.base.verbs import conf_folder, options_of
 
 LAUNCHERS = {
@@ -54,7 +55,7 @@ def one_line(error: BaseException, task: str) -> str:
     chain = list(_chain(error))
     for cause in chain:
         if isinstance(cause, HudepthError):
-            return " ".join(str(cause).split())
+            return " ".join(str(cause).split()) + (_default(cause, task) if isinstance(cause, OptionError) else "")
     for cause in chain:
         if line := gpu_line(cause, task) or _config_line(cause, task):
             return line
@@ -130,8 +131,25 @@ def _config_line(error: BaseException, task: str) -> str | None:
     return " ".join(text.split())
 
 
+def _default(error: OptionError, task: str) -> str:
+    """Return what an option is if nobody sets it, as a sentence; empty if the line has a fix, or it is no option."""
+    if "Leave " in str(error) or "Did you mean" in str(error):
+        return ""
+    value: Any = _composed(task)
+    for part in error.key.split("."):
+        value = value.get(part, "???") if isinstance(value, dict) else "???"
+    if isinstance(value, dict) or any(mark in str(value) for mark in ("???", "${")):
+        return ""
+    return f" The default is {json.dumps(value)}."
+
+
 def known_keys(task: str) -> list[str]:
     """Return all dotted keys and groups of the task's configuration, with the groups chosen on the command line."""
+    keys = list(_dotted(_composed(task)))
+    return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
+
+
+def _composed(task: str) -> Any:
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
@@ -142,8 +160,7 @@ def known_keys(task: str) -> list[str]:
             config = compose(task, overrides=_chosen_groups())
         except Exception:  # a group chosen that this task does not have, which may be the very mistake
             config = compose(task)
-    keys = list(_dotted(OmegaConf.to_container(config, resolve=False)))
-    return [*keys, *(path.name for path in conf_folder().iterdir() if path.is_dir() and not path.name.startswith("_"))]
+    return OmegaConf.to_container(config, resolve=False)
 
 
 def _chosen_groups() -> list[str]:

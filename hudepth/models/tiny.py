@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hudepth.base.options import Range, convert
 from hudepth.models.unet import check_size
 
 STRIDE = 16
 
 
 class TinyUNet(nn.Module):
-    """A few thousand parameters with the hybrid UNet's interface; ``channels``: width of its only hidden layer."""
+    """A few thousand parameters with the hybrid UNet's interface.
+
+    ``channels``, at least 1, else a ConfigError is raised, is the width of its only hidden layer.
+    """
 
     def __init__(self, *, channels: int = 8) -> None:
         super().__init__()
+        convert("model.channels", channels, Annotated[int, Range(1)])
         self.encode = nn.Conv2d(3, channels, STRIDE, stride=STRIDE)
         self.norm = nn.BatchNorm2d(channels)
         self.relu = nn.ReLU()

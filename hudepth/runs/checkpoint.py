@@ -13,7 +13,7 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
-from hudepth.base.errors import CheckpointError, TrainingError, first_line
+from hudepth.base.errors import CheckpointError, TrainingError, did_you_mean, first_line
 from hudepth.base.files import written_whole
 from hudepth.models.build import build_network
 from hudepth.runs import bundles, hub
@@ -99,8 +99,8 @@ class Checkpoint:
             )
 
 
-def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
-    """Return the file or folder that ``spec`` refers to. Raises CheckpointError if there is none.
+def find_checkpoint(spec: str, *, runs: str | Path, key: str = "checkpoint") -> Path:
+    """Return the file or folder that ``spec``, the value of ``key``, means. Raises CheckpointError if there is none.
 
     ``spec`` is a file; a run directory (its best checkpoint, else its last); a bundle; ``last`` (the newest run below
     ``runs``); one of :data:`hudepth.runs.bundles.PRETRAINED`; or ``hf:owner/name``, a bundle on the Hugging Face Hub.
@@ -116,10 +116,11 @@ def find_checkpoint(spec: str, *, runs: str | Path) -> Path:
         if file := best_checkpoint(path):
             return file
         if not is_run(path):
-            raise CheckpointError(f"checkpoint: '{path}' is not a run directory. Pass a file, a run, or last.")
-        raise CheckpointError(f"checkpoint: the run '{path}' has no checkpoint: no epoch was finished. Resume it.")
+            raise CheckpointError(f"{key}: '{path}' is not a run directory. Pass a file, a run, or last.")
+        raise CheckpointError(f"{key}: the run '{path}' has no checkpoint: no epoch was finished. Resume it.")
     if not path.is_file():
-        raise CheckpointError(f"checkpoint: no file or run directory '{path}'. Pass a file, a run directory, or last.")
+        hint = did_you_mean(spec, (*bundles.PRETRAINED, "last"))
+        raise CheckpointError(f"{key}: no file or run directory '{path}'.{hint} Pass a file, a run directory, or last.")
     return path
 
 
@@ -158,9 +159,9 @@ def _damaged(path: Path, error: Exception) -> CheckpointError:
     return CheckpointError(f"'{path}' cannot be read as a checkpoint; it is damaged or cut off ({first_line(error)}).")
 
 
-def load_checkpoint(spec: str, *, runs: str | Path = "runs") -> Checkpoint:
+def load_checkpoint(spec: str, *, runs: str | Path = "runs", key: str = "checkpoint") -> Checkpoint:
     """Read what :func:`find_checkpoint` finds. Raises CheckpointError if it is damaged, unsafe, or not hudepth's."""
-    path = find_checkpoint(spec, runs=runs)
+    path = find_checkpoint(spec, runs=runs, key=key)
     if bundles.is_bundle(path):
         own, tensors, size_bytes = bundles.read_bundle(path)
         epoch, run = own.get("epoch"), None

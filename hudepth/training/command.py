@@ -28,7 +28,7 @@ from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
 from hudepth.runs.run import CHECKPOINTS, LAST, read_config
 from hudepth.runs.sections import check_config, check_resumable
 from hudepth.runs.status import lock_run, write_status
-from hudepth.training.fit import fit
+from hudepth.training.fit import check_parts, fit
 from hudepth.training.initial import Training
 from hudepth.training.options import TrainOptions, parse_options
 
@@ -77,6 +77,7 @@ def _new(cfg: DictConfig) -> Training:
     options = parse_options(config)
     if not _in_sweep() and (key := "variant" if options.variant else "sweep_dir" if options.sweep_dir else None):
         raise ConfigError(f"{key}: only applies to sweeps. Pass +sweep=<name> or -m as well, or leave it out.")
+    check_parts(config, options)
     path = _run_path(config, options)
     begun = (path / CHECKPOINTS / LAST).is_file()  # a job of a sweep that is resumed
     return Training(config, options, path, [] if begun else None, alone=_in_sweep())

@@ -9,14 +9,13 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.loggers import Logger
 from torch import nn
-from torch.optim import Adam, AdamW, Optimizer
-from torch.optim.lr_scheduler import LRScheduler
+from torch.optim import Optimizer
 
 from hudepth.base.camera import CameraChoice
 from hudepth.base.console import log, typed
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
 from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
-from hudepth.base.instantiate import find_class, has_target, import_trusted, instantiate
+from hudepth.base.instantiate import has_target, import_trusted, instantiate
 from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision, uses_cuda
 from hudepth.base.options import parse
 from hudepth.data.build import build_data
@@ -29,15 +28,14 @@ from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
-from hudepth.runs.checkpoint import load_checkpoint, read_plain
+from hudepth.runs.checkpoint import find_checkpoint, load_checkpoint, read_plain
 from hudepth.runs.results import MODEL
 from hudepth.runs.run import best_checkpoint
 from hudepth.training.initial import Parents, Training, network_before, restore_parents
 from hudepth.training.loggers.run import log_tests, open_loggers
 from hudepth.training.module import DepthModule
-from hudepth.training.optim import GroupedAdamW
-from hudepth.training.options import memory_format
-from hudepth.training.schedules import StepSchedule
+from hudepth.training.optim import build_optimizer, build_schedule
+from hudepth.training.options import TrainOptions, memory_format
 from hudepth.training.trainer import build_callbacks, build_run_trainer, one_ending
 
 
@@ -68,10 +66,6 @@ def _fit(training: Training, loggers: list[Logger]) -> float | None:
     if options.compile:
         net.compile()  # in place: names of parameters, and so checkpoints, stay as they are
     module = build_module(config, net, data, trust=options.trust, before=parents)
-    known = module.logged_names()
-    if options.monitor not in known:  # found out before an epoch is lost over it
-        hint = did_you_mean(options.monitor, known)
-        raise ConfigError(f"monitor: no '{options.monitor}'.{hint} Pass one of {', '.join(known)}.")
     callbacks = build_callbacks(config, path, data)
     with without_known_warnings():
         trainer = build_run_trainer(config, path, callbacks, loggers, alone=training.alone)
@@ -99,6 +93,31 @@ def test_best(training: Training, data: DepthDataModule) -> dict[str, Metrics]:
     before = network_before(training, size=data.size, max_depth_m=data.max_depth_m)
     options = parse(ScoreOptions, tested)
     return score_checkpoint(checkpoint, options, output=path / "test", datamodule=data, before=before)
+
+
+def check_parts(config: Mapping[str, Any], options: TrainOptions) -> None:
+    """Build what costs no time, so that a mistake is found before anything is prepared or written.
+
+    Raises ConfigError for parts that cannot be built and metrics that are not logged; CheckpointError if there is no
+    checkpoint ``init``.
+    """
+    trust = options.trust
+    import_trusted(trust)
+    build_data(config["data"], trust=trust, augment=config.get("augment"))
+    if not trust:  # else it may be of any kind
+        with torch.device("meta"):
+            build_network({**config["model"], **({"weights": None} if "weights" in config["model"] else {})})
+    if options.init:
+        find_checkpoint(options.init, runs=config["paths"]["runs"], key="init")
+    loss, distill = instantiate(config["loss"], trust=trust, only=nn.Module), _build_distillation(config, trust=trust)
+    optimizer = build_optimizer(config, [("weight", nn.Parameter(torch.zeros(1)))], encoder=None, trust=trust)
+    if has_target(config["schedule"]):
+        build_schedule(config, optimizer, total_steps=1, trust=trust)
+    module = DepthModule(nn.Identity(), loss, max_depth_m=1.0, optimizer=lambda _: optimizer, distill=distill)
+    known = module.logged_names()
+    if options.monitor not in known:
+        hint = did_you_mean(options.monitor, known)
+        raise ConfigError(f"monitor: no '{options.monitor}'.{hint} Pass one of {', '.join(known)}.")
 
 
 def build_datamodule(training: Training) -> DepthDataModule:
@@ -152,24 +171,12 @@ def build_module(
     ``trust`` lists further modules whose classes a ``_target_`` may name; ``before`` is what the initial weights were
     trained on. Raises ConfigError if a part cannot be built.
     """
-    distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
-
-    def build(key: str, part: Mapping[str, Any], kind: type, argument: Any, own: type, **extra: Any) -> Any:
-        """Build an optimiser or a schedule; only those of hudepth, from the module of ``own``, take ``extra``."""
-        extra = extra if str(part["_target_"]).startswith(f"{own.__module__}.") else {}
-        return instantiate(part, argument, trust=trust, only=kind, key=key, **extra)
 
     def optimizer(parameters: Iterable[tuple[str, nn.Parameter]]) -> Any:
-        optim = dict(config["optim"])
-        if optim.get("fused", False) is None:
-            del optim["fused"]
-            # Others may not take it, and with 16 bits Lightning cannot clip gradients that a fused update unscales.
-            if find_class(optim["_target_"], trust=trust) in (Adam, AdamW, GroupedAdamW):
-                optim["fused"] = not str(config["trainer"]["precision"]).startswith("16")
-        return build("optim", optim, Optimizer, parameters, GroupedAdamW, encoder=find_encoder(net))
+        return build_optimizer(config, parameters, encoder=find_encoder(net), trust=trust)
 
     def schedule(optimizer: Optimizer, total_steps: int) -> Any:
-        return build("schedule", config["schedule"], LRScheduler, optimizer, StepSchedule, total_steps=total_steps)
+        return build_schedule(config, optimizer, total_steps=total_steps, trust=trust)
 
     info = datamodule.store.info
     data = {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")}
@@ -183,11 +190,16 @@ def build_module(
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
         optimizer=optimizer,
-        distill=instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None,
+        distill=_build_distillation(config, trust=trust),
         scheduler=schedule if has_target(config["schedule"]) else None,
         record={"config": dict(config), "split": datamodule.split.summary(), "data": data},
         cuda_graph=bool(config.get("cuda_graph", True)),
     )
+
+
+def _build_distillation(config: Mapping[str, Any], *, trust: list[str]) -> Any:
+    distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
+    return instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None
 
 
 def log_start(trainer: Trainer, module: DepthModule, data: DepthDataModule) -> None:

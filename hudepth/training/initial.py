@@ -90,7 +90,7 @@ def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataM
     Raises CheckpointError if there is no such checkpoint or it belongs to another network, DataError if it was trained
     on pairs that this training validates or tests on.
     """
-    checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"])
+    checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"], key="init")
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))
     checkpoint.fill(net)
     log.info("init: weights of '%s', epoch %d", checkpoint.path, checkpoint.epoch)

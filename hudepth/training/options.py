@@ -37,17 +37,24 @@ class TrainerOptions:
     accelerator: str = "auto"
     num_nodes: Annotated[int, Range(1)] = 1
     precision: str = "tf32"
-    max_epochs: Annotated[int, Range(-1)] | None = None
+    max_epochs: Annotated[int, Range(-1), "a whole number of at least 1"] | None = None
+    max_steps: Annotated[int, Range(-1)] = -1
+    max_time: Any = None
     accumulate_grad_batches: Annotated[int, Range(1)] = 1
     gradient_clip_val: Annotated[float, Range(0)] | None = None
     limit_train_batches: _Share = None
     limit_val_batches: _Share = None
     limit_test_batches: _Share = None
+    overfit_batches: _Share = None
+    deterministic: bool | Literal["warn"] | None = None
     check_val_every_n_epoch: Annotated[int, Range(1)] | None = 1
     log_every_n_steps: Annotated[int, Range(0)] = 50
     fast_dev_run: bool | int = False
 
     def __post_init__(self) -> None:
+        if self.max_epochs == 0 or (self.max_epochs == -1 and self.max_steps < 1 and not self.max_time):
+            why = "0 trains nothing" if self.max_epochs == 0 else "-1 trains for ever, unless +trainer.max_steps is set"
+            raise ConfigError(f"trainer.max_epochs: {why}. Pass a whole number of at least 1.")
         if self.precision.startswith("64"):
             raise ConfigError(
                 f"trainer.precision: {self.precision} is not supported, images have 32 bits. Pass 32-true."
@@ -60,6 +67,12 @@ class TrainerOptions:
 
 
 @dataclass(frozen=True)
+class _EarlyStopping:
+    patience: Annotated[int, Range(0)] = 3
+    min_delta: Annotated[float, Range(0)] = 0.0
+
+
+@dataclass(frozen=True)
 class CallbackOptions:
     """Pictures, early stopping and further callbacks."""
 
@@ -67,6 +80,10 @@ class CallbackOptions:
     panels_every_n_epochs: Annotated[int, Range(1)] = 1
     early_stopping: dict[str, Any] | None = None
     extra: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.early_stopping is not None:
+            parse(_EarlyStopping, self.early_stopping, prefix="callbacks.early_stopping.")
 
 
 @dataclass(frozen=True)
