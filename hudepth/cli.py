@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NoReturn
 
-from hudepth.base.errors import ConfigError, did_you_mean
+from hudepth.base.errors import ConfigError, closest, did_you_mean
 from hudepth.base.options import plain
 from hudepth.base.verbs import OWN_COMMAND, SUBCOMMANDS, commands, conf_folder, module_of, options_of
-from hudepth.base.wording import LAUNCHERS, one_line
+from hudepth.base.wording import LAUNCHERS, known_keys, one_line
 
 ADDED_GROUPS = ("experiment", "sweep")
 """Groups that are no part of the defaults: ``experiment=x`` is turned into the ``+experiment=x`` that Hydra wants."""
@@ -29,6 +29,14 @@ PATHS = {
 
 _WORD = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_][\w./-]{0,99}", re.IGNORECASE)
 """A choice of a group: nothing that Hydra reads as a number or a constant."""
+
+
+_VERBLESS = ("verb=", "-sc", "--shell_completion")
+"""What needs no verb, or has one."""
+_LOOKS = ("--cfg", "-c", "--info", "-i", "--hydra-help")
+"""Flags with which nothing is done but printing, so that a verb may be missing."""
+_SUBJECT = {"predict": "input", **dict.fromkeys(("test", "export", "bench", "demo"), "checkpoint")}
+"""What a word without ``key=`` is probably meant for."""
 
 
 def _main(task: str) -> int:
@@ -47,10 +55,15 @@ def _main(task: str) -> int:
 
         print(f"hudepth {__version__}")
         return 0
+    completes = any(argument.startswith("query=") for argument in arguments)
+    if completes:
+        from hudepth.help import complete
+
+        complete(task)
     debug = [argument for argument in arguments if argument in ("debug=true", "debug=false")]
     try:
         sys.argv[1:] = rewrite(task, [argument for argument in arguments if argument not in debug])
-        _check_flags(sys.argv[1:])
+        _check_flags(task, sys.argv[1:])
         _check_groups(sys.argv[1:])
         return _run_hydra(task)
     except KeyboardInterrupt:
@@ -60,7 +73,8 @@ def _main(task: str) -> int:
     except Exception as error:
         if "debug=true" in debug:
             raise
-        _print_mistake(error, task)
+        if not completes:  # a line that is not finished is no mistake
+            _print_mistake(error, task)
         return 1
 
 
@@ -93,9 +107,11 @@ def rewrite(task: str, arguments: list[str]) -> list[str]:
     multirun = any(a in ("-m", "--multirun") for a in arguments)
     arguments = [_quote_path(argument, multirun=multirun) for argument in arguments]
     result = [f"+{a}" if a.startswith(tuple(f"{g}=" for g in ADDED_GROUPS)) else a for a in arguments]
-    if task in SUBCOMMANDS and not any(a.startswith(("verb=", "-sc", "--shell_completion")) for a in result):
+    if task in SUBCOMMANDS and not any(a.startswith(_VERBLESS) for a in result):
         verbs = [a for a in result if a in SUBCOMMANDS[task]]
         words = [a for a in result if "=" not in a and not a.startswith("-")]
+        if not verbs and any(a.startswith(_LOOKS) for a in result):
+            return result
         if not verbs:
             got = f"no verb '{words[0]}'.{did_you_mean(words[0], SUBCOMMANDS[task])}" if words else "a verb is missing."
             raise ConfigError(f"{got} Type hudepth-{task} followed by {' or '.join(SUBCOMMANDS[task])}.")
@@ -126,22 +142,34 @@ def _quote_path(argument: str, *, multirun: bool) -> str:
     return f"{key}='{escaped}'"
 
 
-def _check_flags(arguments: list[str]) -> None:
+def _check_flags(task: str, arguments: list[str]) -> None:
     """Refuse what Hydra's parser does not take, for which it would print how it is used.
 
     Raises:
-        ConfigError: for these, and for shell completion without saying for which shell.
+        ConfigError: for these, for words that are no ``key=value``, and for shell completion without saying for which
+            shell.
     """
     from hydra._internal.utils import get_args_parser
 
+    parser = get_args_parser()
+
     def refuse(message: str) -> NoReturn:
-        dashed = next((each.lstrip("-") for each in arguments if re.match(r"--?[^=]+=", each)), "")
-        fix = f"Pass {dashed}, without dashes." if dashed else "Write key=value, after flags such as --cfg job."
+        fix = "Write key=value, after flags such as --cfg job."
+        for flag, following in zip(arguments, [*arguments[1:], ""], strict=True):
+            name, _, value = flag.partition("=")
+            if re.match("--?[A-Za-z]", flag) and (value or name not in parser._option_string_actions):
+                key = name.lstrip("-").replace("-", "_")
+                known = known_keys(task)
+                key = key if key in known else closest(key, known)
+                plain_value = following if re.fullmatch("[^-=][^=]*", following) else "<value>"
+                fix = f"Pass {key}={value or plain_value}, without dashes." if key else fix
+                break
         raise ConfigError(f"{message}. {fix}")
 
-    parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]
     given = parser.parse_args(arguments)
+    if task in _SUBJECT and (bare := [word for word in given.overrides if "=" not in word and word[0] != "~"]):
+        raise ConfigError(f"'{bare[0]}': its key is missing. Pass {_SUBJECT[task]}={bare[0]}.")
     if given.shell_completion and not re.match("(un)?install=|query=", " ".join(given.overrides)):
         raise ConfigError("--shell-completion: what is missing. Pass -sc install=bash, or uninstall=bash.")
 

@@ -1,17 +1,25 @@
 from __future__ import annotations
 
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 from hudepth import cli
-from hudepth.base import wording
+from hudepth.base import verbs, wording
 from hudepth.base.errors import ConfigError
+from hudepth.base.verbs import commands, conf_folder
+from hudepth.help import help_text
 from tests.commands import Command
+from tests.terminal import assert_fits
 
 BIN = Path(sys.executable).parent
 
@@ -31,7 +39,25 @@ def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
         ("test", ["checkpoint=x", "model=hybrid_unet"], "no key 'model'. See hudepth-test --cfg job for all keys."),
         ("report", ["figures", "data=rooms"], "no key 'data'. See hudepth-report --cfg job for"),
         ("predict", ["--input=x"], "unrecognized arguments: --input=x. Pass input=x, without dashes."),
-        ("predict", ["--input", "x"], "unrecognized arguments: --input. Write key=value, after flags such as"),
+        ("predict", ["--input", "x"], "unrecognized arguments: --input. Pass input=x, without dashes."),
+        ("predict", ["--batch-size", "4"], "unrecognized arguments: --batch-size. Pass batch_size=4, without"),
+        ("predict", ["photos"], "'photos': its key is missing. Pass input=photos."),
+        ("predict", ["checkpoint=nuy"], "checkpoint: no file or run directory 'nuy'. Did you mean 'nyu'? Pass"),
+        ("predict", [], "input is not set. Pass input=<image | folder | video | camera>."),
+        ("export", ["--checkpoint", "last"], "unrecognized arguments: --checkpoint. Pass checkpoint=last, without"),
+        ("export", ["checkpoint=lsat"], "checkpoint: no file or run directory 'lsat'. Did you mean 'last'? Pass"),
+        ("bench", ["--model=tiny"], "unrecognized arguments: --model=tiny. Pass model=tiny, without dashes."),
+        ("bench", ["checkpoint=nuy"], "checkpoint: no file or run directory 'nuy'. Did you mean 'nyu'? Pass"),
+        ("demo", ["--port", "8000"], "unrecognized arguments: --port. Pass port=8000, without dashes."),
+        ("data", ["info", "--data", "rooms"], "unrecognized arguments: --data rooms. Pass data=rooms, without"),
+        ("data", ["calibrate", "camera=fof=62"], "camera: 'fof=62' is not a camera. Pass camera=auto,"),
+        ("report", ["table", "--runs", "a"], "unrecognized arguments: --runs a. Pass runs=a, without dashes."),
+        ("train", ["--epochs", "3"], "unrecognized arguments: --epochs. Pass trainer.max_epochs=3, without dashes."),
+        ("train", ["-m", "--lr=1,2"], "unrecognized arguments: --lr=1,2. Pass optim.lr=1,2, without dashes."),
+        ("train", ["--nonsense"], "unrecognized arguments: --nonsense. Write key=value, after flags such as"),
+        ("test", ["last"], "'last': its key is missing. Pass checkpoint=last."),
+        ("test", ["checkpoint=x", "protocol=[eigenn]"], "protocol: no 'eigenn'. Did you mean 'eigen'? Pass one of"),
+        ("test", ["checkpoint=nuy"], "checkpoint: no file or run directory 'nuy'. Did you mean 'nyu'? Pass"),
         ("train", ["-x", "seed=1"], "unrecognized arguments: -x"),
         ("data", ["info", "-c"], "argument --cfg/-c: expected one argument. Write key=value"),
         ("test", ["-sc"], "--shell-completion: what is missing. Pass -sc install=bash"),
@@ -55,8 +81,6 @@ def test_a_mistake_gives_one_line_and_exit_code_1(
     task: str, arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    from hydra.core.global_hydra import GlobalHydra
-
     GlobalHydra.instance().clear()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [f"hudepth-{task}", *arguments])
@@ -90,6 +114,44 @@ def test_help_is_our_own_and_loads_no_torch(task: str, tmp_path: Path) -> None:
     assert "nyu_labeled" in done.stdout
 
 
+HIDDEN = {"verb"}
+"""Keys that --help leaves out: the verb is the first word."""
+
+
+@pytest.mark.parametrize("task", commands())
+def test_help_lists_every_key_and_group(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = help_text(task)
+    assert_fits(text, 80)
+    text = text.partition("\nFlags\n")[0]
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        config = OmegaConf.to_container(compose(task))
+    assert isinstance(config, dict)
+    listed = set(re.findall(r"^  (\w+)(?:[.=]| {2,})", text, re.MULTILINE))
+    assert set(config) - listed <= HIDDEN
+    for key in set(re.findall(r"^  (\w+)=", text, re.MULTILINE)):
+        assert key in config  # what is listed exists
+        assert re.search(rf"^  {key}=\S*\s+[^\s=]", text, re.MULTILINE)  # and is explained
+    for group in (each for each in options_of_groups(task) if each in listed):
+        assert all(name in text for name in verbs.options_of(group))
+
+
+def options_of_groups(task: str) -> list[str]:
+    text = (conf_folder() / f"{task}.yaml").read_text(encoding="utf-8")
+    return re.findall(r"^  - (\w+): ", text.partition("defaults:")[2], re.MULTILINE)
+
+
+@pytest.mark.parametrize("flag", [("--cfg", "job"), ("-c", "job"), ("--info", "config"), ("--info",)])
+@pytest.mark.parametrize("task", ["data", "report"])
+def test_a_configuration_is_shown_without_a_verb(task: str, flag: tuple[str, ...], command: Command) -> None:
+    done = command(task, *flag)
+    assert done.code == 0, done.err
+    assert "verb: ???" in done.out
+    assert ("pairs: 200" if task == "data" else "repeats: 2000") in done.out
+    assert command(task, "info" if task == "data" else "table", *flag).code == 0
+
+
 def test_cfg_prints_the_configuration_without_torch(tmp_path: Path) -> None:
     code = (
         "import sys; from hudepth import cli; sys.argv[1:] = ['experiment=badcl', '--cfg', 'job']; cli.train(); "
@@ -101,17 +163,49 @@ def test_cfg_prints_the_configuration_without_torch(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_tab_completion(tmp_path: Path) -> None:
+def completed(line: str, cwd: Path) -> list[str]:
+    """Return what bash offers for a line once completion is installed as --help says; the cursor is at its end."""
     script = f"""
     PATH={BIN}:$PATH
-    eval "$(hudepth-train -sc install=bash)"
-    complete -p hudepth-train >/dev/null || exit 3
-    COMP_LINE="hudepth-train loss=" COMP_POINT=19 COMP_CWORD=1
+    eval "$({line.split()[0]} -sc install=bash)"
+    complete -p {line.split()[0]} | grep -q hydra_bash_completion || exit 3
+    COMP_LINE={shlex.quote(line)} COMP_POINT={len(line)} COMP_CWORD={len(line.split(" ")) - 1}
     hydra_bash_completion
-    echo "${{COMPREPLY[@]}}"
+    printf '%s\\n' "${{COMPREPLY[@]}}"
     """
-    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, text=True, capture_output=True, check=False)
-    assert "loss=berhu" in done.stdout, done.stdout + done.stderr
+    done = subprocess.run(["bash", "-c", script], cwd=cwd, text=True, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    return done.stdout.split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+@pytest.mark.parametrize(
+    ("line", "offers"),
+    [
+        ("hudepth-train los", {"loss=", "loss."}),
+        ("hudepth-train loss=", {"loss=badcl", "loss=silog"}),
+        ("hudepth-train loss=silog loss.var", {"loss.variance_focus="}),
+        ("hudepth-train -m init=2011_09_26 trainer.max", {"trainer.max_epochs="}),
+        ("hudepth-test checkpoint=last protocol=kit", {"protocol=kitti_eigen"}),
+        ("hudepth-predict checkpoint=(x sm", {"smoothing="}),
+        ("hudepth-export form", {"format="}),
+        ("hudepth-bench model=ti", {"model=tiny"}),
+        ("hudepth-demo po", {"port="}),
+        ("hudepth-data pre", {"prepare"}),
+        ("hudepth-data ", {"audit", "data=", "pairs="}),
+        ("hudepth-data audit data=nyu_l", {"data=nyu_labeled", "data=nyu_labeled_mat"}),
+        ("hudepth-report com", {"compare"}),
+        ("hudepth-report compare repe", {"repeats="}),
+    ],
+)
+def test_tab_completion(line: str, offers: set[str], tmp_path: Path) -> None:
+    found = completed(line, tmp_path)
+    assert offers <= set(found)
+    assert all(each.startswith(line.split(" ")[-1]) for each in found)
+
+
+def test_a_verb_is_not_offered_twice(tmp_path: Path) -> None:
+    assert "prepare" not in completed("hudepth-data audit p", tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -30,9 +30,11 @@ GPUS = {
 
 _STRATEGIES = ("auto", *StrategyRegistry.available_strategies())
 _PRECISIONS = (
-    "tf32", "fast", "32-true", "bf16-mixed", "16-mixed", "32", "16", "bf16", "bf16-true", "16-true", "64-true", "64",
-    "transformer-engine", "transformer-engine-float16",
+    "tf32", "fast", "32-true", "bf16-mixed", "16-mixed", "bf16-true", "16-true", "64-true", "transformer-engine",
+    "transformer-engine-float16",
 )  # fmt: skip
+_SHORT = ("16", "32", "64", "bf16")
+"""Names that Lightning takes for 16-mixed, and so on."""
 _KINDS = {
     "accelerator": Annotated[str, Choice(("auto", "gpu", *sorted(AcceleratorRegistry.available_accelerators())))],
     "devices": Annotated[int, Range(1)] | Literal["auto", -1],
@@ -72,8 +74,9 @@ def check_devices(options: Mapping[str, Any]) -> None:
         hint = did_you_mean(unknown[0], inspect.signature(Trainer).parameters)
         raise ConfigError(f"trainer.{unknown[0]}: lightning.Trainer has no such argument.{hint or ' Leave it out.'}")
     for key, kind in _KINDS.items():
-        if not isinstance(options.get(key), list | None):
-            convert(f"trainer.{key}", options[key], kind)
+        value = options.get(key)
+        if not (isinstance(value, list | None) or (key == "precision" and str(value) in _SHORT)):
+            convert(f"trainer.{key}", value, kind)
     if taken := sorted(_SET_HERE & options.keys()):
         raise ConfigError(f"trainer.{taken[0]} is set by hudepth. See logger= and callbacks= for your own.")
     accelerator = str(options.get("accelerator", "auto"))

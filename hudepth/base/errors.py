@@ -63,9 +63,15 @@ def did_you_mean(name: str, choices: Iterable[str]) -> str:
     Dotted names are compared as a whole and by their last part, so that ``model.headz`` finds
     ``model.attention_heads``' neighbours as well as keys that were moved to another group.
     """
+    found = closest(name, choices)
+    return f" Did you mean '{found}'?" if found else ""
+
+
+def closest(name: str, choices: Iterable[str]) -> str:
+    """Return the choice that :func:`did_you_mean` suggests; empty if none is close."""
     known = list(choices)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if not close:
         last = {choice.rsplit(".", 1)[-1]: choice for choice in known}
         close = [last[match] for match in difflib.get_close_matches(name.rsplit(".", 1)[-1], last, n=1, cutoff=0.6)]
-    return f" Did you mean '{close[0]}'?" if close else ""
+    return close[0] if close else ""

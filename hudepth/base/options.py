@@ -127,7 +127,7 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     from omegaconf import OmegaConf
 
     if missing := sorted(OmegaConf.missing_keys(cfg)):
-        known = {"checkpoint": "file | run directory | last", "input": "image | folder | video | camera"}
+        known = {"checkpoint": "file | run directory | last"}
         raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<{known.get(missing[0], 'value')}>.")
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
@@ -194,7 +194,7 @@ def _convert_scalar(value: Any, hint: Any, marks: tuple[Any, ...]) -> Any:
     raise _MismatchError
 
 
-def _choose(value: Any, names: Sequence[str]) -> Any:
+def _choose(value: Any, names: Sequence[Any]) -> Any:
     if value not in names:
         raise _MismatchError(str(value))
     return value
@@ -204,12 +204,12 @@ def _is_list(value: object) -> bool:
     return isinstance(value, list | tuple)
 
 
-def _choices(hint: Any) -> Sequence[str]:
+def _choices(hint: Any) -> Sequence[Any]:
     """Return the names a type may be, wherever in it they are stated."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Literal:
         return args
-    marked: Iterable[Sequence[str]] = (arg.names if isinstance(arg, Choice) else _choices(arg) for arg in args)
+    marked: Iterable[Sequence[Any]] = (arg.names if isinstance(arg, Choice) else _choices(arg) for arg in args)
     return next((names for names in marked if names), ())
 
 
@@ -221,7 +221,8 @@ def _describe(hint: Any, bounds: str = "") -> str:
     if origin is Annotated and (words := next((mark for mark in args[1:] if isinstance(mark, str)), "")):
         return words
     if names := _choices(hint):
-        return f"{'a list of some' if origin is list else 'one'} of {', '.join(map(str, names))}"
+        listed = ", ".join(map(str, names))
+        return f"{'a list of some' if origin is list else 'one'} of {listed}" if len(names) > 1 else listed
     if origin is Annotated:
         return _describe(args[0], next((f" {mark}" for mark in args[1:] if isinstance(mark, Range)), bounds))
     if origin in (list, Sequence, tuple):

@@ -138,7 +138,7 @@ def _default(error: OptionError, task: str) -> str:
     value: Any = _composed(task)
     for part in error.key.split("."):
         value = value.get(part, "???") if isinstance(value, dict) else "???"
-    if isinstance(value, dict) or any(mark in str(value) for mark in ("???", "${")):
+    if value is None or isinstance(value, dict) or any(mark in str(value) for mark in ("???", "${")):
         return ""
     return f" The default is {json.dumps(value)}."
 

@@ -11,6 +11,7 @@ import torch
 
 from hudepth.base.console import log, track
 from hudepth.base.errors import ConfigError
+from hudepth.base.files import output_folder
 from hudepth.base.wording import more_room
 from hudepth.bench.contenders import Contenders
 from hudepth.bench.plan import Plan, make_plan
@@ -38,7 +39,7 @@ def bench(config: dict[str, Any]) -> None:
 def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda _: None) -> Measured:
     """Build all contenders and those that ``more`` starts, then measure them in turns.
 
-    Raises HudepthError if the network cannot be built, or nothing could be measured.
+    Raises HudepthError if the network cannot be built, the output folder cannot be made, or nothing could be measured.
     """
     assert plan.threads
     assert plan.backends
@@ -47,6 +48,7 @@ def measure(plan: Plan, *, runs: str, more: Callable[[Contenders], Any] = lambda
     rates: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="hudepth-bench-") as made:
         subject = make_subject(plan, Path(made), runs=runs)
+        output_folder(plan.output)  # before minutes of work
         log.info(
             "%s of %s parameters, %d x %d, %s; %s; each in a process of its own, threads: %d",
             subject.name, f"{subject.parameters:,}", *subject.size,

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import output_folder
 from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Choice, Range, Size, parse
 from hudepth.bench.backends import BACKENDS, ON_CPU, ON_GPU, REFERENCE
@@ -50,7 +49,5 @@ class Plan:
 
 
 def make_plan(config: dict[str, Any]) -> Plan:
-    """Check every option, and make the output folder; raises ConfigError if an option is wrong or that fails."""
-    plan = parse(Plan, config)
-    output_folder(plan.output)
-    return plan
+    """Check every option; raises ConfigError if one is wrong."""
+    return parse(Plan, config)

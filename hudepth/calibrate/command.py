@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import torch
 
-from hudepth.base.camera import NYU_FOCAL, CameraOption
+from hudepth.base.camera import NYU_FOCAL, CameraChoice, CameraOption
 from hudepth.base.console import log
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.machine import torch_device, usable_cores
@@ -46,6 +46,8 @@ class CalibrateOptions:
 def calibrate(config: dict[str, Any]) -> None:
     """Fit, cross-validate and store a calibration as conf/data.yaml states; raises HudepthError."""
     options = parse(CalibrateOptions, config)
+    if options.camera is not None:
+        CameraChoice.of(options.camera)
     source = None if options.points else build_data(options.data, trust=options.trust).source
     name = options.points.stem if options.points else source.name if source else ""
     output = Path(options.output or f"calibrated_{name}").expanduser()

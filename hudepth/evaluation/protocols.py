@@ -22,17 +22,23 @@ def build_protocols(protocols: Mapping[str, Any], *, datamodule: DepthDataModule
     Warns, once for a data module, of a protocol that leaves out most of the depths the network predicts: rooms' caps on
     streets.
     """
+    built = make_protocols(protocols, trust=trust)
+    native = [protocol.name for protocol in built if protocol.needs_native]
+    if native and not datamodule.native:
+        why = "scores at native resolution, which data.native=false leaves out"
+        raise ConfigError(f"protocol={native[0]} {why}. Pass data.native=true, or protocol=paper.")
+    _warn_of_caps(built, datamodule)
+    return built
+
+
+def make_protocols(protocols: Mapping[str, Any], *, trust: list[str]) -> list[Protocol]:
+    """Build test protocols for any data. Raises ConfigError if there is none, or one cannot be built."""
     for name, protocol in protocols.items():
         if protocol and not (isinstance(protocol, Mapping) and has_target(protocol)):
             raise ConfigError(f"protocol.{name}: '{protocol}' is not a protocol. Pass one, as in protocol=eigen.")
     built = [instantiate(protocol, trust=trust, only=Protocol) for protocol in protocols.values() if protocol]
     if not built:
         raise ConfigError("protocol: none is set. Pass protocol=paper, protocol=eigen or protocol=[paper,eigen].")
-    native = [protocol.name for protocol in built if protocol.needs_native]
-    if native and not datamodule.native:
-        why = "scores at native resolution, which data.native=false leaves out"
-        raise ConfigError(f"protocol={native[0]} {why}. Pass data.native=true, or protocol=paper.")
-    _warn_of_caps(built, datamodule)
     return built
 
 

@@ -38,13 +38,11 @@ _FOR_ALL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}  # 
 class PredictOptions(ModelOptions):
     """Options of hudepth-predict; conf/predict.yaml explains them."""
 
-    input: str
+    input: str | None = None
     output: str = "predictions"
     formats: list[Annotated[str, Choice(tuple(FORMATS))]] | None = None
     recursive: bool = False
-    scale_m: Annotated[tuple[float, float], "auto or two rising distances [near,far] in metres"] | Literal["auto"] = (
-        "auto"
-    )
+    scale_m: Annotated[tuple[float, float], "two rising distances [near,far] in metres"] | Literal["auto"] = "auto"
     points: Annotated[int, Range(1)] | None = None
     edges: bool = False
     max_uncertainty: Annotated[float, Range(0, above=True)] | None = None
@@ -100,13 +98,15 @@ class Job:
 def predict(config: dict[str, Any]) -> None:
     """Predict all inputs of conf/predict.yaml; raises HudepthError, for unreadable inputs once all others are done."""
     options = parse(PredictOptions, {**config, "runs": config["paths"]["runs"]})
+    model = load_model(options)
+    if options.input is None:
+        raise ConfigError("input is not set. Pass input=<image | folder | video | camera>.")
     inputs = find_inputs(options.input, recursive=options.recursive, output=Path(options.output).expanduser())
     output = output_folder(options.output)
     for line in inputs.left_out:
         log.info("%s", line)
     if output.resolve() in {item.path.parent.resolve() for item in (*inputs.images, *inputs.videos)}:
         raise ConfigError(f"output: '{output}' is the folder of the input. Pass another, output=<folder>.")
-    model = load_model(options)
     log.info("model: %s; %s, fit=%s", model.info, model.backend.name, model.fit)
     cv2.setNumThreads(1)  # decoding and writing have threads of their own
     job = Job(model, output, options.style, options)

@@ -28,9 +28,10 @@ from hudepth.runs.identity import RESUMABLE, is_below, part_bound_to_length
 from hudepth.runs.run import CHECKPOINTS, LAST, read_config
 from hudepth.runs.sections import check_config, check_resumable
 from hudepth.runs.status import lock_run, write_status
-from hudepth.training.fit import check_parts, fit
+from hudepth.training.fit import fit
 from hudepth.training.initial import Training
 from hudepth.training.options import TrainOptions, parse_options
+from hudepth.training.parts import check_parts
 
 RUN_ENV = "HUDEPTH_RUN"
 """Holds the run directory that the first process of a distributed run made, for the others."""

@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 from hudepth.base.camera import CameraChoice
 from hudepth.base.console import log, typed
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
-from hudepth.base.errors import CheckpointError, ConfigError, did_you_mean
+from hudepth.base.errors import CheckpointError, ConfigError
 from hudepth.base.instantiate import has_target, import_trusted, instantiate
 from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision, uses_cuda
 from hudepth.base.options import parse
@@ -28,14 +28,14 @@ from hudepth.evaluation.score import ScoreOptions, score_checkpoint
 from hudepth.models.build import build_network
 from hudepth.models.encoder import find_encoder
 from hudepth.runs import run_dir
-from hudepth.runs.checkpoint import find_checkpoint, load_checkpoint, read_plain
+from hudepth.runs.checkpoint import load_checkpoint, read_plain
 from hudepth.runs.results import MODEL
 from hudepth.runs.run import best_checkpoint
 from hudepth.training.initial import Parents, Training, network_before, restore_parents
 from hudepth.training.loggers.run import log_tests, open_loggers
 from hudepth.training.module import DepthModule
-from hudepth.training.optim import build_optimizer, build_schedule
-from hudepth.training.options import TrainOptions, memory_format
+from hudepth.training.options import memory_format
+from hudepth.training.parts import build_distillation, build_optimizer, build_schedule
 from hudepth.training.trainer import build_callbacks, build_run_trainer, one_ending
 
 
@@ -95,37 +95,10 @@ def test_best(training: Training, data: DepthDataModule) -> dict[str, Metrics]:
     return score_checkpoint(checkpoint, options, output=path / "test", datamodule=data, before=before)
 
 
-def check_parts(config: Mapping[str, Any], options: TrainOptions) -> None:
-    """Build what costs no time, so that a mistake is found before anything is prepared or written.
-
-    Raises ConfigError for parts that cannot be built and metrics that are not logged; CheckpointError if there is no
-    checkpoint ``init``.
-    """
-    trust = options.trust
-    import_trusted(trust)
-    build_data(config["data"], trust=trust, augment=config.get("augment"))
-    if not trust:  # else it may be of any kind
-        with torch.device("meta"):
-            build_network({**config["model"], **({"weights": None} if "weights" in config["model"] else {})})
-    if options.init:
-        find_checkpoint(options.init, runs=config["paths"]["runs"], key="init")
-    loss, distill = instantiate(config["loss"], trust=trust, only=nn.Module), _build_distillation(config, trust=trust)
-    optimizer = build_optimizer(config, [("weight", nn.Parameter(torch.zeros(1)))], encoder=None, trust=trust)
-    if has_target(config["schedule"]):
-        build_schedule(config, optimizer, total_steps=1, trust=trust)
-    module = DepthModule(nn.Identity(), loss, max_depth_m=1.0, optimizer=lambda _: optimizer, distill=distill)
-    known = module.logged_names()
-    if options.monitor not in known:
-        hint = did_you_mean(options.monitor, known)
-        raise ConfigError(f"monitor: no '{options.monitor}'.{hint} Pass one of {', '.join(known)}.")
-
-
 def build_datamodule(training: Training) -> DepthDataModule:
     """Prepare the data, and check the protocols of the final test while nothing is lost yet."""
     config, trust = training.config, training.options.trust
     distill = config.get("distill") or {}
-    if has_target(distill) and not distill.get("teacher"):
-        raise ConfigError("distill.teacher is not set. Pass distill.teacher=<folder of depths>, or distill=none.")
     teacher = {"teacher": distill["teacher"]} if has_target(distill) else {}
     data = build_data({**config["data"], **teacher}, trust=trust, augment=config.get("augment"))
     if data.source.name == "rooms":
@@ -190,16 +163,11 @@ def build_module(
         instantiate(config["loss"], trust=trust, only=nn.Module),
         max_depth_m=datamodule.max_depth_m,
         optimizer=optimizer,
-        distill=_build_distillation(config, trust=trust),
+        distill=build_distillation(config, trust=trust),
         scheduler=schedule if has_target(config["schedule"]) else None,
         record={"config": dict(config), "split": datamodule.split.summary(), "data": data},
         cuda_graph=bool(config.get("cuda_graph", True)),
     )
-
-
-def _build_distillation(config: Mapping[str, Any], *, trust: list[str]) -> Any:
-    distill = {key: value for key, value in (config.get("distill") or {}).items() if key != "teacher"}
-    return instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None
 
 
 def log_start(trainer: Trainer, module: DepthModule, data: DepthDataModule) -> None:

@@ -3,50 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim import Adam, AdamW, Optimizer
-from torch.optim.lr_scheduler import LRScheduler
+from torch.optim import AdamW, Optimizer
 
 from hudepth.base.errors import ConfigError
-from hudepth.base.instantiate import find_class, instantiate
-from hudepth.training.schedules import StepSchedule
-
-
-def build_optimizer(
-    config: Mapping[str, Any],
-    parameters: Iterable[tuple[str, nn.Parameter]],
-    *,
-    encoder: nn.Module | None,
-    trust: list[str],
-) -> Optimizer:
-    """Build the optimiser of a configuration. Raises ConfigError if it cannot be built.
-
-    Of hudepth's own it is told the ``encoder``. ``trust`` lists further modules whose classes may be named.
-    """
-    optim = dict(config["optim"])
-    if optim.get("fused", False) is None:
-        del optim["fused"]
-        # Others may not take it, and with 16 bits Lightning cannot clip gradients that a fused update unscales.
-        if find_class(optim["_target_"], trust=trust) in (Adam, AdamW, GroupedAdamW):
-            optim["fused"] = not str(config["trainer"]["precision"]).startswith("16")
-    extra = {"encoder": encoder} if str(optim["_target_"]).startswith(f"{__name__}.") else {}
-    built: Optimizer = instantiate(optim, parameters, trust=trust, only=Optimizer, key="optim", **extra)
-    return built
-
-
-def build_schedule(
-    config: Mapping[str, Any], optimizer: Optimizer, *, total_steps: int, trust: list[str]
-) -> LRScheduler:
-    """Build the learning-rate schedule of a configuration; arguments and errors as of :func:`build_optimizer`."""
-    schedule = config["schedule"]
-    own = str(schedule["_target_"]).startswith(f"{StepSchedule.__module__}.")
-    extra = {"total_steps": total_steps} if own else {}
-    built: LRScheduler = instantiate(schedule, optimizer, trust=trust, only=LRScheduler, key="schedule", **extra)
-    return built
 
 
 def fit_state(optimizer: Optimizer) -> None:

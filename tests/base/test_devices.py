@@ -72,10 +72,12 @@ def test_what_is_there(accelerator: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"accelerator": "cpu", "devises": 1}, r"^trainer: .*unexpected keyword argument 'devises'"),
-        ({"accelerator": "abacus"}, r"^trainer: .*abacus"),
-        ({"accelerator": "cpu", "devices": 0}, r"^trainer: .*devices"),
-        ({"accelerator": "cpu", "precision": "8-bits"}, r"^trainer: .*8-bits"),
+        ({"accelerator": "cpu", "devises": 1}, r"^trainer\.devises: .*Did you mean 'devices'\?"),
+        ({"accelerator": "abacus"}, r"^trainer\.accelerator: .*abacus"),
+        ({"accelerator": "cpu", "devices": 0}, r"^trainer\.devices: 0"),
+        ({"accelerator": "cpu", "precision": "8-bits"}, r"^trainer\.precision: .*8-bits"),
+        ({"accelerator": "cpu", "strategy": "dpp"}, r"^trainer\.strategy: .*Did you mean 'ddp'\?"),
+        ({"accelerator": "cpu", "val_check_interval": "abc"}, r"^trainer: .*val_check_interval"),
     ],
 )
 def test_what_lightning_refuses_is_a_mistake_in_the_configuration(options: dict[str, Any], message: str) -> None:

@@ -266,14 +266,15 @@ def test_losses_of_torch_need_none() -> None:
 
 
 def test_sizes_that_torch_refuses() -> None:
-    assert "TinyUNet" in refused({"_target_": "hudepth.models.TinyUNet", "channels": -1})
+    negative = {"_target_": "torch.nn.Linear", "in_features": 4, "out_features": -1}
+    assert refused(negative, trust=["torch.nn"]).startswith("torch.nn.Linear: ")
 
 
 @pytest.mark.parametrize(
     ("target", "name", "value", "what"),
     [
-        ("torch.optim.AdamW", "lr", "abc", "a number"),
-        ("torch.optim.AdamW", "weight_decay", [{"a": 1}], "a number"),
+        ("torch.optim.AdamW", "lr", "abc", "a number of at least 0"),
+        ("torch.optim.AdamW", "weight_decay", [{"a": 1}], "a number of at least 0"),
         ("torch.optim.SGD", "nesterov", "abc", "true or false"),
         ("torch.optim.lr_scheduler.StepLR", "step_size", 2.5, "a whole number"),
         ("torch.optim.lr_scheduler.CosineAnnealingLR", "eta_min", "abc", "a number"),

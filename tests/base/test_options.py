@@ -72,9 +72,9 @@ def test_what_is_taken(key: str, typed: object, value: object) -> None:
         ("camera", [1, 2, 3], "[1,2,3] is not a list of 4 numbers"),
         ("camera", 1, "1 is not a list of 4 numbers"),
         ("flip", 1, "1 is not true or false"),
-        ("inner", 3, "3 is not a group of options"),
+        ("inner", 3, "3 is not a mapping of options"),
         ("inner", {"panels": -1}, "inner.panels: -1 is not a whole number of at least 0"),
-        ("extra", [1], "[1] is not a group of options"),
+        ("extra", [1], "[1] is not a mapping of options"),
         ("input", None, "input is not set"),
         ("input", ["a"], "[a] is not text"),
     ],
@@ -131,7 +131,7 @@ def test_bounds(low: int, value: int) -> None:
 
 def test_a_union_takes_the_first_that_fits() -> None:
     assert convert("batch_size", "auto", int | Literal["auto"]) == "auto"
-    with pytest.raises(ConfigError, match="a whole number or one of auto"):
+    with pytest.raises(ConfigError, match="a whole number or auto"):
         convert("batch_size", [], int | Literal["auto"])
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 from pathlib import Path
 
@@ -108,7 +109,6 @@ MISTAKES = [
     (("size=[32]",), r"size: \[32\] is not"),
     (("device=tpu",), "device: 'tpu' is not"),
     (("checkpoint=last",), "checkpoint, model: both are set"),
-    (("output=/dev/null/x",), "output: cannot write to '/dev/null/x'"),
 ]
 
 
@@ -123,7 +123,12 @@ def test_bad_options_are_one_line(arguments: tuple[str, ...], line: str, tmp_pat
 
 @pytest.mark.parametrize(
     ("argument", "line"),
-    [("size=[30,32]", "multiple"), ("model.channels=x", ""), ("bakends=[eager]", "no key 'bakends'. Did you mean")],
+    [
+        ("size=[30,32]", "multiple"),
+        ("model.channels=x", ""),
+        ("output=/dev/null/x", "output: cannot write to"),
+        ("bakends=[eager]", "no key 'bakends'. Did you mean"),
+    ],
 )
 def test_what_cannot_be_built_is_one_line(argument: str, line: str, command: Command) -> None:
     done = command("bench", *TINY, argument)
@@ -144,4 +149,4 @@ def test_help_shows_how(command: Command) -> None:
     done = command("bench", "--help")
     assert done.code == 0
     assert "hudepth-bench checkpoint=<model> | model=NAME" in done.out
-    assert "model       hybrid_unet" in done.out
+    assert re.search(r"^  model +hybrid_unet", done.out, re.MULTILINE)
