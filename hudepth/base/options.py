@@ -127,8 +127,8 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     from omegaconf import OmegaConf
 
     if missing := sorted(OmegaConf.missing_keys(cfg)):
-        known = {"checkpoint": "file | run directory | last"}
-        raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<{known.get(missing[0], 'value')}>.")
+        what = "file | run directory | last" if missing[0] == "checkpoint" else "value"
+        raise ConfigError(f"{missing[0]} is not set. Pass {missing[0]}=<{what}>.")
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     return {str(key): value for key, value in config.items()}
@@ -236,9 +236,8 @@ def _describe(hint: Any, bounds: str = "") -> str:
 def _show(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {True: "true", False: "false", None: "null"}[value]
-    text = f"'{value}'" if isinstance(value, str) else str(value)
-    if _is_list(value):
-        text = f"[{','.join(_show(item).strip(chr(39)) for item in value[:100])}]"
+    items = [_show(item).strip("'") for item in value[:100]] if _is_list(value) else []
+    text = f"[{','.join(items)}]" if _is_list(value) else f"'{value}'" if isinstance(value, str) else str(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
