@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import cv2
@@ -221,6 +222,11 @@ def test_a_table_lists_every_choice(group: str) -> None:
     (table,) = re.findall(rf"^\| `{re.escape(group)}=` \|.*\n\|(?:---\|)+\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     listed = set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
     assert listed == {path.stem for path in (ROOT / "conf" / group.lstrip("+")).glob("*.yaml")} - {"base"}
+
+
+def test_a_table_lists_every_extra() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGES[ROOT / "docs" / "install.md"], re.MULTILINE)) == set(extras)
 
 
 def test_make_help_lists_every_target() -> None:
