@@ -114,9 +114,11 @@ def paste(lines: list[str], cwd: Path) -> None:
 def test_a_training_counts_epochs_and_ends_with_what_to_do_next(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = in_terminal(80, "train", *TINY, "paths.runs=my runs", "test=false", cwd=tmp_path, cache=cache)
+    options = ("paths.runs=my runs", "test=false", "logger=[csv,tensorboard]")
+    done = in_terminal(80, "train", *TINY, *options, cwd=tmp_path, cache=cache)
     assert done.code == 0, done.out
     assert_fits(done.out, 80)
+    assert "v_num" not in done.out  # Lightning would show by which name the first logger knows the run
     (run,) = (tmp_path / "my runs" / "default").iterdir()
     counted = re.findall(r"^epoch (\d) of (\d)( |:)", done.out, re.MULTILINE)
     assert {(epoch, last) for epoch, last, kind in counted if kind == " "} == {("1", "2"), ("2", "2")}  # the bar
