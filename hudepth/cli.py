@@ -39,6 +39,17 @@ _SUBJECT = {"predict": "input", **dict.fromkeys(("test", "export", "bench", "dem
 """What a word without ``key=`` is probably meant for."""
 
 
+def _script(task: str) -> int:
+    """Run one task; whoever reads its output may leave early, as ``head`` does."""
+    try:
+        code = _main(task)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+        return 141  # as of a program that SIGPIPE ended
+    return code
+
+
 def _main(task: str) -> int:
     """Run one task with the arguments of this process; return its exit code."""
     # Threads that wait for each other soon sleep. By default they spin for milliseconds, and prediction beside another
@@ -71,7 +82,7 @@ def _main(task: str) -> int:
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     except Exception as error:
-        if "debug=true" in debug:
+        if "debug=true" in debug or isinstance(error, BrokenPipeError):
             raise
         if not completes:  # a line that is not finished is no mistake
             _print_mistake(error, task)
@@ -87,7 +98,7 @@ def _print_mistake(error: Exception, task: str) -> None:
 def __getattr__(name: str) -> Callable[[], int]:
     """Return the function of the console script ``hudepth-<name>``; it returns an exit code."""
     if name in commands():
-        return partial(_main, name)
+        return partial(_script, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

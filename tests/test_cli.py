@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -18,7 +19,7 @@ from hudepth.base import verbs, wording
 from hudepth.base.errors import ConfigError
 from hudepth.base.verbs import commands, conf_folder
 from hudepth.help import help_text
-from tests.commands import Command
+from tests.commands import Command, script
 from tests.terminal import assert_fits
 
 BIN = Path(sys.executable).parent
@@ -286,3 +287,14 @@ def test_rewrite_refuses_an_unknown_verb() -> None:
 
 def test_an_unforeseen_error_is_one_line_too() -> None:
     assert wording.one_line(KeyError("x"), "train") == "KeyError: 'x' (debug=true shows the traceback)"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--cfg", "job"]])
+def test_a_reader_that_leaves_early_is_no_error(arguments: list[str], tmp_path: Path) -> None:
+    call: dict[str, Any] = dict(script("predict", *arguments, cwd=tmp_path, cache=tmp_path))
+    with subprocess.Popen(**{**call, "stderr": subprocess.PIPE}) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
