@@ -7,6 +7,8 @@ import importlib
 import importlib.util
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -68,9 +70,10 @@ def imported(name: str) -> Any:
 
 @pytest.mark.parametrize("page", API, ids=lambda page: page.stem)
 def test_the_examples_of_the_api(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-    options = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
-    found = doctest.testfile(str(page), module_relative=False, globs={"cache": tmp_path}, optionflags=options)
+    (tmp_path / "experiments").symlink_to(ROOT / "experiments")  # whose runs are read
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))  # of the cache
+    found = doctest.testfile(str(page), module_relative=False, optionflags=doctest.ELLIPSIS)
     assert not found.failed
 
 
@@ -117,6 +120,34 @@ def test_every_key_of_a_command_is_explained() -> None:
         for file in [] if group in tables.COMPOSITIONS else files:
             for option in tables.read(file).options:
                 assert option.comment or known.get(option.key) or not option.value, f"{file}: {option.key}"
+
+
+@pytest.mark.parametrize("address", ["", "https://example.org/depth/blob/main"])
+def test_links_to_files_lead_to_the_repository_or_are_paths(address: str, tmp_path: Path) -> None:
+    (tmp_path / "training.md").write_text("# Other\n\n## The camera\n")
+    (tmp_path / "page.md").write_text(
+        "# Page\n\nA [study](../experiments/units), the file ([ledger](../experiments/ledger/ledger.md)), "
+        "[CITATION.cff](CITATION.cff), [here](training.md#the-camera), [there](docs/training.md).\n"
+    )
+    conf = ["extensions = ['myst_parser', 'repository_links']", "myst_heading_anchors = 3", "root_doc = 'page'"]
+    conf += [f"import sys; sys.path.insert(0, {str(DOCS / '_site')!r})", "import repository_links"]
+    conf += [f"repository_links.repository = lambda: {address!r}", "exclude_patterns = ['out']"]
+    (tmp_path / "conf.py").write_text("\n".join(conf))
+    command = [sys.executable, "-m", "sphinx", "-q", "-b", "html", str(tmp_path), str(tmp_path / "out")]
+    done = subprocess.run(command, text=True, capture_output=True, check=True)
+    assert "xref_missing" not in done.stderr
+    text = (tmp_path / "out" / "page.html").read_text()
+    plain = re.sub(r"<[^>]+>", "", text)
+    assert 'href="training.html#the-camera"' in text
+    assert 'href="training.html"' in text
+    if address:
+        for path in ("experiments/units", "experiments/ledger/ledger.md", "CITATION.cff"):
+            assert f'href="{address}/{path}"' in text
+        assert "A study, the file (ledger), CITATION.cff, here" in plain
+    else:
+        assert (
+            "A study (experiments/units), the file (ledger, experiments/ledger/ledger.md), CITATION.cff, here" in plain
+        )
 
 
 def test_links_that_lead_nowhere_are_found(tmp_path: Path) -> None:
