@@ -49,7 +49,7 @@ def test_old_runs_have_a_switch_for_tensorboard(config: dict[str, Any]) -> None:
         ("compile", "maybe", "true or false"), ("test", 1, "true or false"), ("name", "../x", "folder"),
         ("name", None, "not set"), ("callbacks.panels", -1, "at least 0"), ("callbacks.panels", 1.5, "whole number"),
         ("callbacks.panels_every_n_epochs", 0, "at least 1"), ("callbacks.extra", 3, "list"),
-        ("logger.tensorboard", "no", "true or false"), ("logger.wandb", True, "group of options"),
+        ("logger.tensorboard", "no", "true or false"), ("logger.wandb", True, "mapping of options"),
         ("trainer.log_every_n_steps", -1, "at least 0"), ("trainer.accumulate_grad_batches", 0, "at least 1"),
         ("trainer.gradient_clip_val", -1, "at least 0"), ("trainer.precision", "bf16-true", "loses updates"),
         ("trainer.max_epochs", 2.5, "whole number"), ("trainer.limit_val_batches", "/", "number"),
