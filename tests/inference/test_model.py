@@ -56,8 +56,8 @@ def test_the_bundled_pretrained_model_sees_depth() -> None:
     assert 0.3 < metres.min() < metres.max() < 10
 
 
-def test_a_missing_bundled_model_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hudepth.runs.bundles.find_spec", lambda _: None)
+def test_a_missing_bundled_model_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("hudepth.runs.bundles.shipped", lambda *_: tmp_path)
     with pytest.raises(CheckpointError, match=r"checkpoint: .*'nyu'"):
         hudepth.load("nyu")
 
