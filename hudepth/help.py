@@ -84,6 +84,7 @@ def complete(command: str) -> None:
     verbs = SUBCOMMANDS.get(command, ())
     if "=" not in word and not set(verbs) & set(before):
         print(*(verb for verb in verbs if verb.startswith(word)))
-    chosen = (each for each in before if (conf_folder() / each.partition("=")[0].lstrip("+") / "").is_dir())
+    pairs = ((each, each.partition("=")[0].lstrip("+")) for each in before if not each.startswith("debug="))
+    chosen = (each for each, group in pairs if group and (conf_folder() / group).is_dir())
     os.environ["COMP_LINE"] = " ".join([script, *chosen, word])
     os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))

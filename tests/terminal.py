@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import pty
 import re
 import struct
 import sys
-import termios
 from pathlib import Path
 
 from rich.cells import cell_len
@@ -26,6 +23,10 @@ def in_terminal(width: int, task: str, *arguments: str, cwd: Path, cache: Path) 
     Colours are left out, and of a line that was written again and again, as a progress bar is, the states follow each
     other as lines.
     """
+    import fcntl  # none of these is there on Windows
+    import pty
+    import termios
+
     process, terminal = pty.fork()
     if process == 0:
         os.chdir(cwd)

@@ -186,7 +186,7 @@ def completed(line: str, cwd: Path) -> list[str]:
         ("hudepth-train los", {"loss=", "loss."}),
         ("hudepth-train loss=", {"loss=badcl", "loss=silog"}),
         ("hudepth-train loss=silog loss.var", {"loss.variance_focus="}),
-        ("hudepth-train -m init=2011_09_26 trainer.max", {"trainer.max_epochs="}),
+        ("hudepth-train -m init=2011_09_26 debug=true trainer.max", {"trainer.max_epochs="}),
         ("hudepth-test checkpoint=last protocol=kit", {"protocol=kitti_eigen"}),
         ("hudepth-predict checkpoint=(x sm", {"smoothing="}),
         ("hudepth-export form", {"format="}),
