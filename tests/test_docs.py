@@ -135,8 +135,8 @@ def test_every_command_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(nyu, "official_test", lambda: frozenset(range(12, 20)))
     for command in sorted(COMMANDS, key=place):
         words = shortened(command)
-        if not words or words[0] == "source":
-            continue  # the tests run inside the environment
+        if not words or words[0] in ("source", "eval"):
+            continue  # the tests run inside the environment; tests/test_cli.py completes in a real shell
         if words[0] == "make":
             subprocess.run(["make", "--dry-run", "--directory", str(ROOT), *words[1:]], check=True, capture_output=True)
             continue
