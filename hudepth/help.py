@@ -17,7 +17,7 @@ Flags
   -m                multirun: comma-separated values become one run each
   debug=true        show the traceback of an error
   -sc install=bash  tab completion: eval "$(hudepth-{command} -sc install=bash)"
-                    also zsh, fish"""
+                    in bash and zsh; for fish: -sc install=fish | source"""
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+): *(?P<value>(?:[^\s#]|(?<=\S) (?! *#)|(?<=\S)#)*) *(?:# (?P<about>.*))?")
 _MARGIN = 22
 
