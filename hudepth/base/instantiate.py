@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, cast
 
-from hudepth.base.errors import ConfigError, HudepthError, did_you_mean
+from hudepth.base.errors import ConfigError, HudepthError, did_you_mean, first_line
 from hudepth.base.options import Range, convert
 
 TRUSTED = (
@@ -124,7 +124,7 @@ def _build(
     except HudepthError:
         raise
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # RuntimeError: torch, of sizes
-        raise ConfigError(f"{config['_target_']}: {(str(error).splitlines() or [''])[0]}") from error
+        raise ConfigError(f"{config['_target_']}: {first_line(error)}") from error
 
 
 def _suggestion(target: type, arguments: Mapping[str, Any]) -> str:

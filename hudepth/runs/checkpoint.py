@@ -106,7 +106,7 @@ def find_checkpoint(spec: str, *, runs: str | Path, key: str = "checkpoint") -> 
     ``runs``); one of :data:`hudepth.runs.bundles.PRETRAINED`; or ``hf:owner/name``, a bundle on the Hugging Face Hub.
     """
     if spec.startswith(hub.PREFIX):
-        return hub.download(spec)
+        return hub.download(spec, key=key)
     if spec in bundles.PRETRAINED:
         return bundles.pretrained(spec)
     path = newest_run(runs) if spec == "last" else Path(spec).expanduser()

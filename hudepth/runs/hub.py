@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hudepth.base.console import log
-from hudepth.base.errors import CheckpointError, ConfigError, HudepthError
+from hudepth.base.errors import CheckpointError, ConfigError, HudepthError, first_line
 from hudepth.runs.bundles import CONFIG, MAX_CONFIG_BYTES, MAX_WEIGHTS_BYTES, WEIGHTS
 
 PREFIX = "hf:"
@@ -22,15 +22,16 @@ FILES = {CONFIG: MAX_CONFIG_BYTES, WEIGHTS: MAX_WEIGHTS_BYTES}
 _LOGIN = "Run hf auth login, or set HF_TOKEN"
 
 
-def download(spec: str) -> Path:
+def download(spec: str, *, key: str) -> Path:
     """Return the folder of ``hf:owner/name`` or ``hf:owner/name@revision`` in the local cache.
 
-    Without a network it is what the cache holds. Raises CheckpointError if there is no such model, it is private or no
-    bundle, or the Hub cannot be reached; ConfigError if huggingface_hub is not installed.
+    ``key`` is the option that names it. Without a network it is what the cache holds. Raises CheckpointError if there
+    is no such model, it is private or no bundle, or the Hub cannot be reached; ConfigError if huggingface_hub is not
+    installed.
     """
     name, _, after = spec.removeprefix(PREFIX).partition("@")
     revision = after or None
-    with _worded("checkpoint", spec, CheckpointError):
+    with _worded(key, spec, CheckpointError):
         from huggingface_hub import HfApi, errors, hf_hub_download
 
         try:
@@ -48,7 +49,7 @@ def download(spec: str) -> Path:
         sizes = {each.rfilename: each.size or 0 for each in found.siblings or ()}
         for file, limit in FILES.items():
             if sizes.get(file, 0) > limit:
-                raise CheckpointError(f"checkpoint: '{spec}' is refused: its {file} is larger than {limit >> 20} MiB.")
+                raise CheckpointError(f"{key}: '{spec}' is refused: its {file} is larger than {limit >> 20} MiB.")
         files = [hf_hub_download(name, file, revision=revision) for file in FILES]
         return Path(files[-1]).parent
 
@@ -87,7 +88,7 @@ def _worded(key: str, name: str, kind: type[HudepthError]) -> Iterator[None]:
     try:
         yield
     except errors.HFValidationError:
-        raise kind(f"{where} is no name of the Hub. Write {PREFIX if key == 'checkpoint' else ''}owner/name.") from None
+        raise kind(f"{where} is no name of the Hub. Write {'' if key == 'push' else PREFIX}owner/name.") from None
     except errors.LocalTokenNotFoundError:
         raise kind(f"{where}: nobody is logged in to the Hugging Face Hub. {_LOGIN}.") from None
     except errors.GatedRepoError:
@@ -108,5 +109,5 @@ def _worded(key: str, name: str, kind: type[HudepthError]) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno:
             raise kind(f"{where}: cannot write its files ({error.strerror}). Set HF_HOME=<another folder>.") from None
         online = "Unset HF_HUB_OFFLINE" if isinstance(error, errors.OfflineModeIsEnabled) else "Go online"
-        reason = f"error {status}" if status else (str(error).split(". ")[0].splitlines() or [type(error).__name__])[0]
+        reason = f"error {status}" if status else first_line(error).split(". ")[0]
         raise kind(f"{where}: the Hub does not answer ({reason}). {online}.") from error

@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 from hudepth.base.camera import CameraChoice
 from hudepth.base.console import log, typed
 from hudepth.base.devices import check_shares, is_first_process, without_known_warnings
-from hudepth.base.errors import CheckpointError, ConfigError
+from hudepth.base.errors import CheckpointError, ConfigError, first_line
 from hudepth.base.instantiate import has_target, import_trusted, instantiate
 from hudepth.base.machine import float32_products, keep_freed_memory, resolve_precision, uses_cuda
 from hudepth.base.options import parse
@@ -213,7 +213,7 @@ def run_epochs(training: Training, trainer: Trainer, module: DepthModule, data: 
             steps = read_plain(last).get("global_step") if last else None
             if trainer.global_step not in (0, steps) or last is None:
                 raise
-            why = (str(error).splitlines() or [""])[0][:200]  # torch and Lightning fail in many ways on foreign states
+            why = first_line(error)  # torch and Lightning fail in many ways on foreign states
             raise CheckpointError(
                 f"'{last}' does not fit this training ({type(error).__name__}: {why}). Train again without resume=."
             ) from error

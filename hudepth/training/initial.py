@@ -74,7 +74,7 @@ def network_before(training: Training, *, size: tuple[int, int], max_depth_m: fl
     if not training.options.init or not training.options.baselines:
         return None
     try:
-        checkpoint = load_checkpoint(str(training.config["init"]), runs=training.config["paths"]["runs"])
+        checkpoint = load_checkpoint(str(training.config["init"]), runs=training.config["paths"]["runs"], key="init")
         net = checkpoint.build_net(trust=training.options.trust)
         before_m = float(checkpoint.config["data"]["max_depth_m"])
     except (HudepthError, KeyError, TypeError, ValueError) as error:
