@@ -108,6 +108,11 @@ def test_a_model_that_cannot_be_had_is_one_line(hub: Hub, bundle: Path, spec: st
     assert "\n" not in str(error.value)
 
 
+def test_the_option_that_names_the_model_is_said(hub: Hub) -> None:
+    with pytest.raises(CheckpointError, match=r"^init: 'hf:owner/nothing': the Hub has no such model"):
+        load_checkpoint("hf:owner/nothing", key="init")
+
+
 def test_a_damaged_model_is_refused_like_any_file(hub: Hub, bundle: Path) -> None:
     config = (bundle / "config.json").read_bytes()
     hub.files["owner/depth"] = {"config.json": config, "model.safetensors": b"not tensors"}
