@@ -14,8 +14,8 @@ from torch import Tensor
 from hudepth.base.errors import ConfigError
 from hudepth.base.machine import copy_to
 from hudepth.base.options import Range, check
-from hudepth.data.colours import MAX_BLUR, blur, change_colours, cut_depth
-from hudepth.data.warp import Geometry, cut_border, resize, warp
+from hudepth.data.transforms.colours import MAX_BLUR, blur, change_colours, cut_depth
+from hudepth.data.transforms.warp import Geometry, cut_border, resize, warp
 
 _Share = Annotated[float, Range(0, 1)]
 _Factor = Annotated[Sequence[float], Range(0, 10), "[lowest,highest] within 0 and 10"]

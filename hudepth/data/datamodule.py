@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -14,21 +13,23 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from torch.nn import functional
-from torch.utils.data import DataLoader, DistributedSampler
+from torch.utils.data import DataLoader
 
 from hudepth.base.console import log
-from hudepth.base.errors import DataError
+from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.images import MAX_NATIVE_PIXELS
 from hudepth.base.options import Choice, Range, TrainSize, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
-from hudepth.data.dataset import BlockShuffle, DeviceDataset, LateLoader, ShardSampler, StoreDataset, as_is, on_device
+from hudepth.data.dataset import DeviceDataset, LateLoader, StoreDataset, as_is, on_device
+from hudepth.data.order import ShardSampler, epoch_seed
 from hudepth.data.prepare import OnError, prepare, share_beyond
 from hudepth.data.preprocess import TrainingBatches, preprocess
 from hudepth.data.resolution import read_stages, size_at
 from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split, check_split, make_split
 from hudepth.data.store import DepthStore
+from hudepth.data.stream import StreamDataset
 from hudepth.data.teacher import TeacherDepths
 
 _COUNT = Annotated[int, Range(1)]
@@ -37,11 +38,6 @@ EVALUATION_BATCH = 4
 MAX_WORKERS = 1024
 """Loader and preparing processes at most; more would only take the memory of the machine."""
 _WORKERS = Annotated[int, Range(1, MAX_WORKERS)]
-
-
-def epoch_seed(purpose: str, seed: int, epoch: int, rank: int) -> int:
-    """Return a seed that depends on these alone, so that a resumed run draws what it would have drawn."""
-    return int.from_bytes(hashlib.sha256(f"{purpose} {seed} {epoch} {rank}".encode()).digest()[:7])
 
 
 class DepthDataModule(LightningDataModule):
@@ -59,7 +55,9 @@ class DepthDataModule(LightningDataModule):
         on_device: keep the training pairs in the device's memory; ``auto``: on a GPU, if half of what is free suffices.
         seed: of the order of training pairs and of augmentation, which depend only on it and the epoch.
         shuffle_block: for stores larger than memory: shuffle blocks of so many neighbouring pairs, then the pairs
-            within a few blocks; see :class:`hudepth.data.dataset.BlockShuffle`.
+            within a few blocks (:class:`hudepth.data.order.BlockShuffle`).
+        stream: train on so many new pairs each epoch, which the source generates, instead of stored ones; see
+            :class:`hudepth.data.stream.StreamDataset`. Validation and test use stored ones.
         cache, native, on_error, prepare_workers: of the depth store; see :func:`hudepth.data.prepare.prepare`.
 
     """
@@ -81,6 +79,7 @@ class DepthDataModule(LightningDataModule):
         on_device: bool | str = "auto",
         seed: int = 42,
         shuffle_block: int | None = None,
+        stream: int | None = None,
         cache: str | Path = "~/.cache/hudepth",
         native: bool = True,
         on_error: str = "raise",
@@ -104,6 +103,7 @@ class DepthDataModule(LightningDataModule):
         self.on_device: str = convert("data.on_device", str(on_device).lower(), choices)
         self.prepare_workers: int | None = convert("data.prepare_workers", prepare_workers, _WORKERS | None)
         self.shuffle_block: int | None = convert("data.shuffle_block", shuffle_block, _COUNT | None)
+        self.stream: int | None = convert("data.stream", stream, _COUNT | None)
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
         self.cache: Path = convert("data.cache", cache, Path)
@@ -158,22 +158,22 @@ class DepthDataModule(LightningDataModule):
             raise DataError(
                 f"data.split={self.split.kind}: all pairs are test, none train or validate. Pass another data.split."
             )
-        rank, world_size = self._shard()
-        dataset = self._training_pairs()
-        # Shuffles by seed + epoch alone (Lightning sets the epoch), so a resumed run sees the same order.
-        if self.shuffle_block is None:
-            order: Any = DistributedSampler(dataset, world_size, rank, shuffle=True, seed=self.seed)
-            return self._loader(dataset, order, self.batch_size)
-        sampler = BlockShuffle(
-            dataset.indices, block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size,
-            read_ahead=self.store.read_ahead,
-        )  # fmt: skip
-        return self._loader(dataset, sampler, self.batch_size)
+        pairs, (rank, world_size) = self._training_pairs(), self._shard()
+        order = pairs.order(block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size)
+        return self._loader(pairs, order, self.batch_size)
 
-    def _training_pairs(self) -> StoreDataset:
+    def _training_pairs(self) -> StoreDataset | StreamDataset:
+        if self.stream is not None:
+            if self.teacher_folder is not None:
+                raise ConfigError("data.stream: a teacher has no depths of new pairs. Pass data.stream=null.")
+            return StreamDataset(self.source, size=self.size, count=self.stream)
         pairs = StoreDataset(self.store, self.split.train, teacher=self.teacher)
         wanted = self._device.type == "cuda" if self.on_device == "auto" else self.on_device == "true"
         return on_device(pairs, self._device) if wanted and pairs.teacher is None else pairs
+
+    def training_id(self, index: int) -> str:
+        """Return the id of the training pair that a batch calls ``index``."""
+        return (self.store.records[index] if self.stream is None else self.source.generated(index)).id
 
     @property
     def _device(self) -> torch.device:
@@ -233,7 +233,7 @@ class DepthDataModule(LightningDataModule):
             count = min(count, max(1, MAX_NATIVE_PIXELS // largest))
         return self._loader(dataset, ShardSampler(len(dataset), rank=rank, world_size=world_size), count)
 
-    def _loader(self, dataset: StoreDataset, sampler: Any, batch_size: int) -> DataLoader[RawBatch]:
+    def _loader(self, dataset: StoreDataset | StreamDataset, sampler: Any, batch_size: int) -> DataLoader[RawBatch]:
         there = isinstance(dataset, DeviceDataset)
         return LateLoader(
             dataset,

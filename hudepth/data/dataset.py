@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, Sampler
 
 from hudepth.base.console import log
 from hudepth.base.machine import copy_to
 from hudepth.base.types import RawBatch
+from hudepth.data.order import BlockShuffle
 from hudepth.data.store import DepthStore
 from hudepth.data.teacher import TeacherDepths
 
@@ -52,6 +52,16 @@ class StoreDataset(Dataset[RawBatch]):
         if self.teacher is not None:
             batch["teacher_m"] = torch.from_numpy(self.teacher.read(rows))
         return batch
+
+    def order(self, *, block: int | None, seed: int, rank: int, world_size: int) -> Sampler[int]:
+        """Return the shuffled positions of an epoch, in blocks if ``block`` is given (:class:`BlockShuffle`).
+
+        They depend only on seed and epoch (Lightning sets the epoch), so that a resumed run sees the same order.
+        """
+        if block is None:
+            return DistributedSampler(self, world_size, rank, shuffle=True, seed=seed)
+        ahead = self.store.read_ahead
+        return BlockShuffle(self.indices, block=block, seed=seed, rank=rank, world_size=world_size, read_ahead=ahead)
 
 
 class DeviceDataset(StoreDataset):
@@ -110,63 +120,3 @@ class LateLoader(DataLoader[RawBatch]):
 def as_is(batch: Any) -> Any:
     """Collate nothing: the data set already returned a batch."""
     return batch
-
-
-class ShardSampler(Sampler[int]):
-    """Every ``world_size``-th position, in order and without the repetitions of torch's DistributedSampler."""
-
-    def __init__(self, length: int, *, rank: int, world_size: int) -> None:
-        self._positions = range(rank, length, world_size)
-
-    def __len__(self) -> int:
-        return len(self._positions)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._positions)
-
-
-class BlockShuffle(Sampler[int]):
-    """Shuffles training pairs so that they are read from the disk in large pieces.
-
-    A store larger than memory is read from the disk each epoch, and scattered reads are slow. So blocks of neighbouring
-    pairs are shuffled, then the pairs within each group of a few blocks. The order depends only on seed and epoch. Each
-    process gets every ``world_size``-th pair; if that does not divide evenly, the first pairs are repeated, so that
-    all processes take equally many steps.
-
-    Args:
-        rows: position of each pair in the store.
-        block: number of neighbouring pairs that are read together.
-        group: number of blocks whose pairs are mixed; they are in memory at once.
-        read_ahead: called with the first and last row of each block before its pairs are read.
-    """
-
-    def __init__(
-        self, rows: Sequence[int], *, block: int, seed: int, rank: int = 0, world_size: int = 1, group: int = 16,
-        read_ahead: Callable[[int, int], None] | None = None,
-    ) -> None:  # fmt: skip
-        self.rows = np.asarray(rows)
-        self.block, self.seed, self.rank, self.world_size, self.group = block, seed, rank, world_size, group
-        self.read_ahead, self.epoch = read_ahead, 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Take another order; Lightning calls this."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return -(-len(self.rows) // self.world_size)
-
-    def __iter__(self) -> Iterator[int]:
-        random = np.random.default_rng((self.seed, self.epoch))
-        sorted_positions = np.argsort(self.rows, kind="stable")
-        blocks = [sorted_positions[i : i + self.block] for i in range(0, len(self.rows), self.block)]
-        blocks = [blocks[i] for i in random.permutation(len(blocks))]
-        groups = [blocks[i : i + self.group] for i in range(0, len(blocks), self.group)]
-        orders = [random.permutation(np.concatenate(group)) for group in groups]
-        starts = dict(zip(np.cumsum([0, *map(len, orders)]).tolist(), groups, strict=False))
-        order = np.resize(np.concatenate(orders), len(self) * self.world_size).tolist()
-        for place, position in enumerate(order):
-            if self.read_ahead and place in starts:
-                for block in starts[place]:
-                    self.read_ahead(int(self.rows[block[0]]), int(self.rows[block[-1]]))
-            if place % self.world_size == self.rank:
-                yield position

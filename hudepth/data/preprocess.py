@@ -13,7 +13,7 @@ from hudepth.base.normalise import normalise_image
 from hudepth.base.types import Batch, RawBatch
 from hudepth.cuda.functions import Replayed
 from hudepth.data.augment import Augmentation
-from hudepth.data.warp import resize
+from hudepth.data.transforms.warp import resize
 
 
 def preprocess(

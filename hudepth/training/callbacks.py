@@ -16,7 +16,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hudepth.base.console import duration, log
 from hudepth.base.devices import spell_epoch
-from hudepth.data.datamodule import epoch_seed
+from hudepth.data.order import epoch_seed
 from hudepth.data.store import DepthStore
 from hudepth.evaluation.pictures import make_panels
 from hudepth.runs.history import write_history

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hudepth.data.rooms.fittings import FREE, WALL, ceiling_lamp, door, picture, rug, skirting, window
-from hudepth.data.rooms.furniture import Part, Piece, Rng
-from hudepth.data.rooms.raycast import F64, Solids
+from hudepth.data.rooms.furniture import Part, Piece, Rng, around
+from hudepth.data.rooms.look import SNAPSHOT, STUDIO, Look
+from hudepth.data.rooms.raycast import BOX, CYLINDER, ELLIPSOID, F64, Solids
 
 
 class Habits(NamedTuple):
@@ -26,14 +27,34 @@ class Habits(NamedTuple):
     """Range of the camera's height [m]."""
     pitch: tuple[float, float]
     """Range of the camera's pitch [rad]; negative looks down."""
+    loose_things: int = 0
+    """At most so many things lie on furniture, besides those that belong to it."""
+    look: Look = STUDIO
+    """Light and camera."""
 
 
 VARIETIES = {
     "usual": Habits(0.38, (3.6, 6.0), (1.8, 3.6), 0.9, (1.1, 1.7), (-0.28, -0.08)),
     "wide": Habits(0.55, (3.0, 9.0), (1.0, 5.0), 0.5, (0.7, 1.9), (-0.6, 0.05)),
+    "homes": Habits(0.65, (2.6, 9.0), (0.9, 5.0), 0.45, (0.6, 1.9), (-0.6, 0.15), loose_things=70, look=SNAPSHOT),
 }
 """``usual``: rooms as one would photograph them. ``wide``: small, large and crowded rooms seen from near and far, with
-depths spread as in NYU Depth V2."""
+depths spread as in NYU Depth V2. ``homes``: as ``wide``, and full of loose things, in mixed light, through the camera
+of a phone: over- and underexposed, with wrong white balance, noise, blur and the blocks of JPEG."""
+
+_LOOSE = (
+    "accent0",
+    "accent1",
+    "accent2",
+    "accent3",
+    "dark",
+    "white",
+    "books",
+    "pillow",
+    "fabric",
+    "cardboard",
+    "metal",
+)
 
 
 class FurnishedRoom:
@@ -49,6 +70,8 @@ class FurnishedRoom:
         self.low, self.high = np.empty((0, 3)), np.empty((0, 3))
         self.placed: list[tuple[Part, float, float, float]] = []
         self._furnish(category, habits.covered_floor)
+        if habits.loose_things:
+            self._scatter(habits.loose_things)
 
     def _furnish(self, category: str, covered_floor: float) -> None:
         rng, free, wall = self.rng, FREE[category], WALL[category]
@@ -71,6 +94,24 @@ class FurnishedRoom:
         for side in range(4):
             self._add(skirting(x if side < 2 else z), *self._at_wall(side, 0.5))
         self._add(ceiling_lamp(height), x / 2, z / 2 - 0.22, 0.0)
+
+    def _scatter(self, most: int) -> None:
+        """Hang up more pictures, and put loose things on flat parts at the height of knees to shoulders."""
+        rng = self.rng
+        for _ in range(int(rng.integers(8))):
+            self._put_at_wall(picture(rng))
+        flat = [
+            (part, place)
+            for part, *place in self.placed
+            if part.kind == BOX and 0.25 < part.y[1] < 1.4 and min(np.ptp(part.x), np.ptp(part.z)) > 0.2
+        ]
+        for _ in range(int(rng.integers(most)) if flat else 0):
+            part, place = flat[int(rng.integers(len(flat)))]
+            (x, z), y = (rng.uniform(*span) for span in (part.x, part.z)), part.y[1]
+            width, height, depth = np.exp(rng.uniform(np.log(0.03), np.log([0.18, 0.3, 0.18])))
+            kind = int(rng.choice([BOX, BOX, CYLINDER, ELLIPSOID]))
+            spans = around(x, width), (y - 0.01, y + height), around(z, width if kind == CYLINDER else depth)
+            self.placed.append((Part(str(rng.choice(_LOOSE)), *spans, kind), *place))
 
     def _put(self, piece: Piece, x: float, z: float, yaw: float, *, gap: float = 0.03) -> bool:
         """Place a piece with the middle of its back at x, z, if its space is free and inside the room."""

@@ -10,6 +10,7 @@ import numpy as np
 from hudepth.data.rooms.fittings import CATEGORIES
 from hudepth.data.rooms.furnishing import VARIETIES, FurnishedRoom, Habits
 from hudepth.data.rooms.furniture import Rng
+from hudepth.data.rooms.look import Look
 from hudepth.data.rooms.materials import room_materials
 from hudepth.data.rooms.raycast import F64, Solids, camera_axes, pinhole_view, trace
 from hudepth.data.rooms.shading import Light, Scene, shadow_map
@@ -42,7 +43,7 @@ class Room(NamedTuple):
     path: CameraPath
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=64)
 def build_room(seed: int, scene: int, variety: str = "usual") -> Room:
     """Build a room of a key of ``VARIETIES``; the same on every call, in every process."""
     category = CATEGORIES[scene % len(CATEGORIES)]
@@ -54,21 +55,22 @@ def build_room(seed: int, scene: int, variety: str = "usual") -> Room:
     names = faces + [part.material for part, *_ in room.placed]
     number = np.array([list(materials).index(name) for name in names], np.int16)
     solids = room.solids()
-    main, fill, ambient = _lights(rng, room.size)
+    look = VARIETIES[variety].look
+    main, fill, ambient = _lights(rng, room.size, look)
     shadow = shadow_map(room.size, solids, main.position)
-    furnished = Scene(room.size, solids, list(materials.values()), number, main, fill, ambient, shadow)
+    furnished = Scene(room.size, solids, list(materials.values()), number, main, fill, ambient, shadow, look)
     return Room(furnished, _choose_path(rng, room, solids, VARIETIES[variety]))
 
 
-def _lights(rng: Rng, size: F64) -> tuple[Light, Light, F64]:
+def _lights(rng: Rng, size: F64, look: Look) -> tuple[Light, Light, F64]:
     """Return the ceiling light, a window or lamp that casts no shadows, and the ambient light off the walls."""
     warmth = rng.uniform(0, 1)
     warm = np.array([1.0, 0.92 - 0.14 * warmth, 0.82 - 0.32 * warmth])
     day = np.array([0.85, 0.95, 1.0])
     main = Light(np.array([size[0] / 2, size[1] - 0.16, size[2] / 2]), warm * rng.uniform(4.0, 7.0))
     side = size * [rng.choice([0.08, 0.92]), 0.65, rng.uniform(0.15, 0.85)]
-    fill = Light(side, day * rng.uniform(0.4, 2.2))
-    return main, fill, (0.7 * warm + 0.3 * day) * rng.uniform(0.35, 0.6)
+    fill = Light(side, day * rng.uniform(*look.fill))
+    return main, fill, (0.7 * warm + 0.3 * day) * rng.uniform(*look.ambient)
 
 
 def _choose_path(rng: Rng, room: FurnishedRoom, solids: Solids, habits: Habits) -> CameraPath:

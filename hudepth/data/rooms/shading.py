@@ -5,10 +5,12 @@ from __future__ import annotations
 from functools import cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.camera.intrinsics import Intrinsics
+from hudepth.data.rooms.look import Look
 from hudepth.data.rooms.materials import Material, pattern_weight
 from hudepth.data.rooms.raycast import BOX, CYLINDER, F32, F64, ROOM_FACES, Solids, View, trace
 
@@ -38,6 +40,7 @@ class Scene(NamedTuple):
     """[3] linear RGB."""
     shadow: F32
     """[cells, cells] metres below the ceiling light to the first surface, see :func:`shadow_map`."""
+    look: Look
 
 
 def shadow_map(room_size: F64, solids: Solids, light_position: F64) -> F32:
@@ -176,7 +179,7 @@ def render(scene: Scene, view: View, rng: np.random.Generator) -> tuple[NDArray[
     for colour, amount in sources:
         light += colour.astype(np.float32)[:, None] * amount
     light[:, glow] = 1
-    return _expose((albedo * light).reshape(3, height, width), view, rng), depth
+    return _expose((albedo * light).reshape(3, height, width), view, rng, scene.look), depth
 
 
 @cache
@@ -186,15 +189,25 @@ def _tone_curve() -> F32:
     return np.asarray(255 * np.sqrt((1 - np.exp(-1.9 * linear)) / (1 - np.exp(-3.8))), np.float32)
 
 
-def _expose(linear: F32, view: View, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _expose(linear: F32, view: View, rng: np.random.Generator, look: Look) -> NDArray[np.uint8]:
     """Turn linear light [3, h, w] into 8 bits [h, w, 3], with the blur of a lens and the noise of a sensor."""
     linear[:, 1:-1] = 0.5 * linear[:, 1:-1] + 0.25 * (linear[:, :-2] + linear[:, 2:])
     linear[:, :, 1:-1] = 0.5 * linear[:, :, 1:-1] + 0.25 * (linear[:, :, :-2] + linear[:, :, 2:])
-    gain = 0.15 * rng.uniform(0.5, 1.6) / float(np.minimum(linear[1], 3.0).mean())
-    balance = gain * np.array([rng.uniform(0.94, 1.08), 1, rng.uniform(0.9, 1.08)])
+    gain = 0.15 * rng.uniform(*look.exposure) / float(np.minimum(linear[1], 3.0).mean())
+    balance = gain * np.array([rng.uniform(*look.red), 1, rng.uniform(*look.blue)])
     vignette = 1 - np.float32(rng.uniform(0.1, 0.35)) * np.add.outer(view.ys**2, view.xs**2)
     linear *= vignette * balance.astype(np.float32)[:, None, None]
     step = np.minimum(linear * np.float32(2048), np.float32(4095)).astype(np.int16)
     image: F32 = _tone_curve()[step.transpose(1, 2, 0)]
-    image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(rng.uniform(1.0, 4.0))
-    return np.clip(image, 0, 255).astype(np.uint8)
+    if look.blur:
+        image = cv2.GaussianBlur(image, (0, 0), 0.01 + look.blur * image.shape[0] * rng.random())
+    image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(rng.uniform(*look.noise))
+    values = np.clip(image, 0, 255).astype(np.uint8)
+    if look.contrast != (1.0, 1.0):
+        curve = 255 * np.linspace(0, 1, 256) ** rng.uniform(*look.contrast)
+        values = curve.astype(np.uint8)[values]
+    if look.jpeg_quality is not None:
+        quality = int(rng.uniform(*look.jpeg_quality))
+        encoded = cv2.imencode(".jpg", values, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        values = cv2.imdecode(encoded, cv2.IMREAD_COLOR).astype(np.uint8, copy=False)
+    return values

@@ -96,6 +96,8 @@ class Source(ABC):
     """Scale of ``linear`` and ``disparity`` where a record has none; see :func:`hudepth.data.encoding.to_metres`."""
     invalid: Sequence[float] | None = None
     """Stored values that mean "no reading"; None: the largest of an integer type of 16 bits or more."""
+    pairs_per_scene: int | None = None
+    """How many pairs :meth:`generated` takes of one scene; None if the data is in files."""
     unpaired: list[str] | None = None
     """A list if :meth:`records` is to leave out files without partner and note them there; None if to refuse them."""
     auto_uint8: ClassVar[str | None] = None
@@ -126,6 +128,10 @@ class Source(ABC):
     @abstractmethod
     def read(self, record: Record) -> RawPair:
         """Decode one pair; DataError if a file is missing, truncated, too large, or image and depth do not fit."""
+
+    def generated(self, number: int) -> Record:
+        """Return the record of a new pair, which is none of :meth:`records`, for sources that generate their data."""
+        raise NotImplementedError(f"{self.name}: the data is in files")
 
     def files(self) -> Sequence[Path]:
         """Return every file this source reads; empty for generated data."""

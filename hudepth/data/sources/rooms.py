@@ -25,6 +25,7 @@ RENDERER_VERSION = 1
 """Raise it whenever a change alters any frame: prepared data with another version is out of date."""
 
 MAX_PAIRS = 1_000_000
+_FURTHER = "further_room_"
 _COUNT = Annotated[int, Range(1)]
 _SIZE = Annotated[tuple[int, int], Range(16, 2048), Broadcast(), "[height,width], each from 16 to 2048"]
 _TEST_FRACTION = 0.2
@@ -43,8 +44,9 @@ class RoomsSource(Source):
         scenes: number of rooms. The last fifth (at least one room of two) is the ``test`` split.
         size: (height, width) in pixels, each 16 to 2048; the field of view is always NYU's.
         seed: at least 0; each seed gives other rooms.
-        variety: ``usual``, or ``wide``: more sizes of rooms, fuller, seen from more distances, heights and angles. Use
-            it to train for real images: depths are distributed more as in NYU Depth V2.
+        variety: ``usual``; ``wide``: more sizes of rooms, fuller, seen from more distances, heights and angles, so
+            that depths are distributed more as in NYU Depth V2; or ``homes``: as ``wide``, with loose things
+            everywhere, mixed light and a worse camera.
         holes: remove depth (0) where a Kinect would not measure: in its projector's shadow, on grazing and
             dark surfaces, beyond 8 m, along the border, and in blobs. Everything else stays the same.
 
@@ -73,6 +75,7 @@ class RoomsSource(Source):
             raise ConfigError(
                 f"data.source.scenes: {self.scenes} x {self.frames_per_scene} frames are over {MAX_PAIRS:,}."
             )
+        self.pairs_per_scene = self.frames_per_scene
         self.size: tuple[int, int] = convert("data.source.size", size, _SIZE)
         self.seed: int = convert("data.source.seed", seed, Annotated[int, Range(0)])
         self.variety: str = convert("data.source.variety", variety, Annotated[str, Choice(tuple(VARIETIES))])
@@ -86,6 +89,13 @@ class RoomsSource(Source):
     def records(self) -> Sequence[Record]:
         """List all frames, scene by scene, without rendering any."""
         return [self._record(scene, frame) for scene in range(self.scenes) for frame in range(self.frames_per_scene)]
+
+    def generated(self, number: int) -> Record:
+        """Return the record of a frame in a further room: any number from 0 on, scene by scene."""
+        scene, frame = divmod(number, self.frames_per_scene)
+        name = f"{_FURTHER}{scene:07d}"
+        category = CATEGORIES[(self.scenes + scene) % len(CATEGORIES)]
+        return Record(id=f"{name}/{frame:02d}", scene=name, frame=frame, split="train", category=category)
 
     def read(self, record: Record) -> RawPair:
         """Render one frame: image [H, W, 3] uint8 RGB, depth [H, W] float32 z-depth [m], 0 only in holes.
@@ -117,6 +127,9 @@ class RoomsSource(Source):
         return Record(id=f"{name}/{frame:02d}", scene=name, frame=frame, split=split, category=category)
 
     def _scene_number(self, record: Record) -> int:
+        further = record.scene.removeprefix(_FURTHER)
+        if further.isdecimal() and record == self.generated(int(further) * self.frames_per_scene + record.frame):
+            return self.scenes + int(further)
         digits = record.scene.removeprefix("room_")
         scene = int(digits) if digits.isdecimal() else self.scenes
         known = scene < self.scenes and 0 <= record.frame < self.frames_per_scene
