@@ -1,4 +1,4 @@
-"""What positions of a map know of each other: the transformer block (section 3.1, figure 4), and pooled context."""
+"""What positions of a map know of each other: the transformer block (section 3.1, figure 4), pooled context, scale."""
 
 from __future__ import annotations
 
@@ -93,3 +93,23 @@ class PooledContext(nn.Module):
         """Return a map of the same shape."""
         result: Tensor = x + self.layers(x.mean(dim=(2, 3), keepdim=True))
         return result
+
+
+class ScaleHead(nn.Module):
+    """One number per image, from the mean of its deepest map: what the whole depth map is shifted by before its output.
+
+    Through a sigmoid, small depths are multiplied by its exponential. It starts at 0.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(channels, channels // 2, 1), nn.ReLU(inplace=True), nn.Conv2d(channels // 2, 1, 1)
+        )
+        for parameter in self.layers[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 1 1"]:
+        """Return the shift."""
+        shift: Tensor = self.layers(x.mean(dim=(2, 3), keepdim=True))
+        return shift

@@ -28,7 +28,7 @@ class HybridUNet(UNet):
         weights: of the encoder: ``imagenet``, a path, or ``none`` (see :class:`ResNet18Encoder`).
         attention: transformer blocks on ``none``, ``skip``, ``deepest`` or ``both`` (table A1).
         attention_heads, attention_activation, attention_positions: see :class:`TransformerBlock` (not stated).
-        upsample, output, recompute: see :class:`UNet`.
+        upsample, output, recompute, scale_head: see :class:`UNet`.
         arithmetic: ``plain``, or ``merged``: linear steps as one, with a fifth fewer multiplications and the same
             results up to rounding (:mod:`hudepth.models.decoder`).
         encoder_norm: batch norm of the encoder: ``trained``, or ``frozen`` to its initial statistics.
@@ -57,6 +57,7 @@ class HybridUNet(UNet):
         encoder_norm: str = "trained",
         recompute: bool = False,
         context: bool = False,
+        scale_head: bool = False,
     ) -> None:
         on_skip, on_deepest = choose("model.attention", attention, ATTENTION)
         encoder = ResNet18Encoder.from_pretrained(weights, norm=encoder_norm)
@@ -73,6 +74,7 @@ class HybridUNet(UNet):
             output=output,
             arithmetic=arithmetic,
             recompute=recompute,
+            scale_head=scale_head,
         )
 
     def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:

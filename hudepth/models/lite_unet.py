@@ -57,8 +57,8 @@ class LiteUNet(UNet):
     Args:
         weights: of the encoder: ``imagenet``, a path, or ``none`` (see :class:`EfficientNetLite0Encoder`).
         context: the mean of the deepest map joins each of its positions (:class:`PooledContext`).
-        upsample, output, arithmetic, recompute: see :class:`hudepth.models.unet.UNet`; ``merged`` concerns the head.
-
+        upsample, output, arithmetic, recompute, scale_head: see :class:`hudepth.models.unet.UNet`; ``merged`` concerns
+            the head.
         encoder_norm: batch norm of the encoder: ``trained``, or ``frozen`` to its initial statistics.
 
     Raises:
@@ -78,6 +78,7 @@ class LiteUNet(UNet):
         arithmetic: Arithmetic = "plain",
         encoder_norm: str = "trained",
         recompute: bool = False,
+        scale_head: bool = False,
     ) -> None:
         encoder = EfficientNetLite0Encoder.from_pretrained(weights, norm=encoder_norm)
         super().__init__(
@@ -86,6 +87,7 @@ class LiteUNet(UNet):
             output=output,
             arithmetic=arithmetic,
             recompute=recompute,
+            scale_head=scale_head,
             widths=WIDTHS,
             up_block=LiteUpBlock,
             context=PooledContext(encoder.stages[-1].channels) if context else nn.Identity(),

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hudepth.base.errors import ConfigError
+from hudepth.models.attention import ScaleHead
 from hudepth.models.decoder import Head, UpBlock
 from hudepth.models.encoder import Encoder, run_stage
 from hudepth.models.options import OUTPUTS, choose
@@ -28,6 +29,7 @@ class UNet(nn.Module):
         output: from the last convolution to unit depth, one of :data:`hudepth.models.options.OUTPUTS`.
         arithmetic: ``plain`` or ``merged``; see :mod:`hudepth.models.decoder`.
         recompute: in training, recompute each stage's activations for the gradients instead of keeping them.
+        scale_head: shift the map before its output by a number for the whole image (:class:`ScaleHead`).
         widths: of the up blocks, coarsest first.
         up_block: makes an up block from the channels of the coarse map, of the skip and of its result.
         **attention: further modules, by attribute name, for :meth:`attend`.
@@ -44,6 +46,7 @@ class UNet(nn.Module):
         output: str = "sigmoid",
         arithmetic: str = "plain",
         recompute: bool = False,
+        scale_head: bool = False,
         widths: Sequence[int] | None = None,
         up_block: Callable[..., nn.Module] | None = None,
         **attention: nn.Module,
@@ -62,6 +65,11 @@ class UNet(nn.Module):
         final = choose("model.output", output, OUTPUTS)()
         self.head = Head(channels[-1], getattr(final, "channels_in", 1), arithmetic=arithmetic)
         self.output = final
+        self.scale = ScaleHead(deepest) if scale_head else None
+        if scale_head and self.head.conv.out_channels > 1:
+            raise ConfigError(
+                f"model.scale_head: model.output={output} has no map to shift. Pass model.output=sigmoid."
+            )
 
     def attend(self, features: list[Tensor], run: Callable[..., Any]) -> list[Tensor]:
         """Return the encoder's feature maps, finest first, as the decoder takes them; ``run`` runs a module."""
@@ -74,10 +82,12 @@ class UNet(nn.Module):
         """
         check_size(*image.shape[-2:], stride=self.encoder.stages[-1].stride)
         run = recomputed if self.recompute and self.training else run_stage
-        *skips, x = self.attend(self.encoder(image, run=run), run)
+        *skips, deepest = self.attend(self.encoder(image, run=run), run)
+        x = deepest
         for name, skip in zip(self._up, reversed(skips), strict=True):
             x = run(getattr(self, name), x, skip)
-        unit_depth: Tensor = self.output(self.head(x))
+        x = self.head(x) if self.scale is None else self.head(x) + self.scale(deepest)
+        unit_depth: Tensor = self.output(x)
         return unit_depth
 
 

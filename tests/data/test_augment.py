@@ -17,8 +17,8 @@ from torch import Tensor
 
 from hudepth.base.errors import ConfigError
 from hudepth.data.augment import Augmentation
-from hudepth.data.colours import MAX_BLUR, blur, change_colours, cut_depth
-from hudepth.data.warp import Geometry, _at_most_twice, resize, warp
+from hudepth.data.transforms.colours import MAX_BLUR, blur, change_colours, cut_depth
+from hudepth.data.transforms.warp import Geometry, _at_most_twice, resize, warp
 
 EVERYTHING: dict[str, Any] = {
     "flip": 0.5, "zoom": (1.0, 2.0), "rotate_deg": 20.0, "border": 0.05, "gamma": (0.5, 2.0), "brightness": (0.5, 1.5),

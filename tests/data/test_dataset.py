@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
 from hudepth.data import dataset
-from hudepth.data.dataset import BlockShuffle, DeviceDataset, ShardSampler, StoreDataset, as_is, on_device
+from hudepth.data.dataset import DeviceDataset, StoreDataset, as_is, on_device
+from hudepth.data.order import BlockShuffle, ShardSampler
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter
 

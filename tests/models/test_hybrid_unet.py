@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,9 @@ from torch import Tensor, nn
 from hudepth.base.errors import ConfigError
 from hudepth.base.verbs import conf_folder
 from hudepth.models import HybridUNet
+from hudepth.models.inference import inference_form
+from hudepth.models.lite_unet import LiteUNet
+from hudepth.models.unet import UNet
 
 # Every row of table A1 with a shape: (module here, output without the batch, parameters or None where it states none).
 TABLE_A1 = [
@@ -441,3 +445,29 @@ def test_context_adds_what_the_mean_of_the_deepest_map_says() -> None:
     without.context.forward = context  # type: ignore[method-assign]
     torch.testing.assert_close(net(image), without(image))
     assert not torch.equal(plain, without(image))
+
+
+@pytest.mark.parametrize("make", [HybridUNet, LiteUNet])
+def test_the_scale_head_shifts_each_map_by_a_number_before_its_output(make: Callable[..., UNet]) -> None:
+    torch.manual_seed(0)
+    net, without = make(scale_head=True, output="identity"), make(output="identity").eval()
+    image = torch.randn(2, 3, 32, 64)
+    for norm in net.modules():
+        if isinstance(norm, nn.BatchNorm2d):
+            norm.momentum = None
+    net.train()(image)  # without statistics of its maps, an untrained network hardly sees the image
+    net.eval()
+    without.load_state_dict(net.state_dict(), strict=False)
+    torch.testing.assert_close(net(image), without(image))  # it starts at 0
+    assert net.scale is not None
+    nn.init.normal_(net.scale.layers[-1].weight)
+    shift = net(image) - without(image)
+    means = shift.mean(dim=(1, 2, 3), keepdim=True)
+    torch.testing.assert_close(shift, means.expand_as(shift), rtol=1e-4, atol=1e-4)
+    assert abs(float(means[0] - means[1])) > 1e-3
+    torch.testing.assert_close(inference_form(net, size=(32, 64))(image), net(image), rtol=1e-4, atol=1e-4)
+
+
+def test_bins_have_no_map_that_a_scale_head_could_shift() -> None:
+    with pytest.raises(ConfigError, match=r"^model\.scale_head: model\.output=bins"):
+        HybridUNet(scale_head=True, output="bins")

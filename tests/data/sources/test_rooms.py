@@ -343,6 +343,25 @@ def test_wide_rooms_are_other_rooms() -> None:
 
 
 @pytest.mark.slow
+def test_homes_are_fuller_than_wide_rooms_and_taken_by_a_worse_camera() -> None:
+    scenes = range(24)
+    wide, homes = ([build_room(0, scene, variety).scene for scene in scenes] for variety in ("wide", "homes"))
+    counts = [np.mean([len(scene.surface_material) for scene in rooms]) for rooms in (wide, homes)]
+    assert counts[1] > counts[0] + 15
+    pictures = [
+        np.stack([source.read(record).image for record in source.records()])
+        for source in (
+            RoomsSource(size=SMALL, scenes=24, frames_per_scene=1, variety=name) for name in ("wide", "homes")
+        )
+    ]
+    brightness, balance = (
+        [np.std([statistic(image) for image in images]) for images in pictures]
+        for statistic in (np.mean, lambda image: image[..., 0].mean() / image[..., 2].mean())
+    )
+    assert brightness[1] > 1.3 * brightness[0]
+    assert balance[1] > 1.3 * balance[0]
+
+
 def test_wide_rooms_spread_depths_below_ten_metres_and_look_down_and_up_as_nyu_does() -> None:
     def read(variety: str) -> tuple[Any, Any]:
         source = RoomsSource(scenes=30, frames_per_scene=1, size=(24, 32), variety=variety)
