@@ -21,7 +21,7 @@ ADDED_GROUPS = ("experiment", "sweep")
 
 PATHS = {
     "input", "output", "checkpoint", "resume", "init", "run", "runs", "dir", "a", "b", "name", "images", "sweep_dir",
-    "model.weights", "distill.teacher", "data.root", "data.cache", "data.teacher", "data.source.images",
+    "model.weights", "distill.teacher", "distill.pictures", "data.root", "data.cache", "data.source.images",
     "data.source.depths", "data.source.manifest", "data.source.train_list", "data.source.test_list",
     "paths.runs", "paths.sweeps", "paths.cache", "camera", "predictions", "data.source.camera",
 }  # fmt: skip

@@ -21,7 +21,7 @@ from hudepth.base.images import MAX_NATIVE_PIXELS
 from hudepth.base.options import Choice, Range, TrainSize, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
-from hudepth.data.dataset import DeviceDataset, LateLoader, StoreDataset, as_is, on_device
+from hudepth.data.dataset import DeviceDataset, LateLoader, StoreDataset, as_is, on_device, stored_pairs
 from hudepth.data.order import ShardSampler, epoch_seed
 from hudepth.data.prepare import OnError, prepare, share_beyond
 from hudepth.data.preprocess import TrainingBatches, preprocess
@@ -30,7 +30,6 @@ from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split, check_split, make_split
 from hudepth.data.store import DepthStore
 from hudepth.data.stream import StreamDataset
-from hudepth.data.teacher import TeacherDepths
 
 _COUNT = Annotated[int, Range(1)]
 EVALUATION_BATCH = 4
@@ -50,7 +49,8 @@ class DepthDataModule(LightningDataModule):
         batch_size: pairs per step (the paper: 8); evaluation on a GPU takes four times as many at once.
         progressive: smaller sizes to start with, each until a share of the epochs:
             ``[{size: [112, 112], until: 0.4}]``; see :func:`hudepth.data.resolution.read_stages`.
-        teacher: folder of another model's depths; see :class:`hudepth.data.teacher.TeacherDepths`.
+        teacher: folder of another model's depths; see :class:`hudepth.data.distill.teacher.TeacherDepths`.
+        pictures: folder of pictures without truth; see :class:`hudepth.data.distill.pictures.Pictures`.
         num_workers: loader processes; 0 reads in the training process, which is fast enough for a CPU.
         on_device: keep the training pairs in the device's memory; ``auto``: on a GPU, if half of what is free suffices.
         seed: of the order of training pairs and of augmentation, which depend only on it and the epoch.
@@ -61,6 +61,8 @@ class DepthDataModule(LightningDataModule):
         cache, native, on_error, prepare_workers: of the depth store; see :func:`hudepth.data.prepare.prepare`.
 
     """
+
+    _told = False
 
     def __init__(
         self,
@@ -75,6 +77,7 @@ class DepthDataModule(LightningDataModule):
         progressive: Sequence[Mapping[str, Any]] | None = None,
         augment: Augmentation | None = None,
         teacher: str | Path | None = None,
+        pictures: str | Path | None = None,
         num_workers: int = 0,
         on_device: bool | str = "auto",
         seed: int = 42,
@@ -91,6 +94,7 @@ class DepthDataModule(LightningDataModule):
         check_split(split, fractions)
         self.source, self.augment = source, augment
         self.teacher_folder: Path | None = convert("distill.teacher", teacher, Path | None)
+        self.pictures_folder: Path | None = convert("distill.pictures", pictures, Path | None)
         self.split_kind, self.fractions = split, tuple(fractions)
         self.size: tuple[int, int] = convert("data.size", size, TrainSize)
         self.stages = read_stages(progressive or [], size=self.size)
@@ -109,7 +113,6 @@ class DepthDataModule(LightningDataModule):
         self.cache: Path = convert("data.cache", cache, Path)
         if self.on_error == "skip":
             source.unpaired = []
-        self._told = False
         self._draws: tuple[int, torch.Generator] | None = None
         self._training_batches = TrainingBatches(augment, max_depth_m=self.max_depth_m)
 
@@ -126,14 +129,17 @@ class DepthDataModule(LightningDataModule):
         return make_split(records, kind=self.split_kind, seed=self.split_seed, fractions=self.fractions)
 
     @cached_property
-    def teacher(self) -> TeacherDepths | None:
-        """The teacher's depths of the training pairs, prepared if necessary; None without a teacher."""
-        folder = self.teacher_folder
-        return None if folder is None else TeacherDepths(folder, self.store, self.split.train)
+    def training_pairs(self) -> StoreDataset | StreamDataset:
+        """What is trained on: generated pairs, or stored ones with what a teacher adds, prepared if necessary."""
+        if self.stream is None:
+            return stored_pairs(self.store, self.split, teacher=self.teacher_folder, pictures=self.pictures_folder)
+        if self.teacher_folder is not None:
+            raise ConfigError("data.stream: a teacher has no depths of new pairs. Pass data.stream=null.")
+        return StreamDataset(self.source, size=self.size, count=self.stream)
 
     def prepare_data(self) -> None:
-        """Build the depth store and read the teacher's depths; the first time, warn if most depths are clipped."""
-        _ = self.store, self.teacher
+        """Prepare the depth store and what a teacher adds; the first time, warn if most depths are clipped."""
+        _ = self.training_pairs
         beyond, text = self._clipped()
         if beyond > 0.01 and not self._told:
             log.log(logging.WARNING if beyond > 0.5 else logging.INFO, text)
@@ -158,22 +164,11 @@ class DepthDataModule(LightningDataModule):
             raise DataError(
                 f"data.split={self.split.kind}: all pairs are test, none train or validate. Pass another data.split."
             )
-        pairs, (rank, world_size) = self._training_pairs(), self._shard()
+        pairs, (rank, world_size) = self.training_pairs, self._shard()
+        if self._device.type == "cuda" if self.on_device == "auto" else self.on_device == "true":
+            pairs = on_device(pairs, self._device)
         order = pairs.order(block=self.shuffle_block, seed=self.seed, rank=rank, world_size=world_size)
         return self._loader(pairs, order, self.batch_size)
-
-    def _training_pairs(self) -> StoreDataset | StreamDataset:
-        if self.stream is not None:
-            if self.teacher_folder is not None:
-                raise ConfigError("data.stream: a teacher has no depths of new pairs. Pass data.stream=null.")
-            return StreamDataset(self.source, size=self.size, count=self.stream)
-        pairs = StoreDataset(self.store, self.split.train, teacher=self.teacher)
-        wanted = self._device.type == "cuda" if self.on_device == "auto" else self.on_device == "true"
-        return on_device(pairs, self._device) if wanted and pairs.teacher is None else pairs
-
-    def training_id(self, index: int) -> str:
-        """Return the id of the training pair that a batch calls ``index``."""
-        return (self.store.records[index] if self.stream is None else self.source.generated(index)).id
 
     @property
     def _device(self) -> torch.device:

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, Sampler
 
 from hudepth.base.console import log
+from hudepth.base.errors import ConfigError
 from hudepth.base.machine import copy_to
 from hudepth.base.types import RawBatch
+from hudepth.data.distill.pictures import Pictures
+from hudepth.data.distill.teacher import TeacherDepths
 from hudepth.data.order import BlockShuffle
+from hudepth.data.splits import Split
 from hudepth.data.store import DepthStore
-from hudepth.data.teacher import TeacherDepths
 
+Pairs = TypeVar("Pairs", bound=Dataset[RawBatch])
 _AT_ONCE = 256
 """Pairs that are copied to a device in one go."""
 
@@ -53,6 +58,10 @@ class StoreDataset(Dataset[RawBatch]):
             batch["teacher_m"] = torch.from_numpy(self.teacher.read(rows))
         return batch
 
+    def pair_id(self, index: int) -> str:
+        """Return the id of the pair that a batch calls ``index``."""
+        return self.store.records[index].id
+
     def order(self, *, block: int | None, seed: int, rank: int, world_size: int) -> Sampler[int]:
         """Return the shuffled positions of an epoch, in blocks if ``block`` is given (:class:`BlockShuffle`).
 
@@ -62,6 +71,47 @@ class StoreDataset(Dataset[RawBatch]):
             return DistributedSampler(self, world_size, rank, shuffle=True, seed=seed)
         ahead = self.store.read_ahead
         return BlockShuffle(self.indices, block=block, seed=seed, rank=rank, world_size=world_size, read_ahead=ahead)
+
+
+class PicturedDataset(StoreDataset):
+    """Training pairs, then pictures without truth: their depth is unmeasured, and the teacher's is all there is.
+
+    In a batch, pictures come after pairs, and their ``index`` counts on from the length of the store.
+    """
+
+    def __init__(self, pairs: StoreDataset, pictures: Pictures) -> None:
+        super().__init__(pairs.store, pairs.indices, teacher=pairs.teacher)
+        self.pictures = pictures
+
+    def __len__(self) -> int:
+        return len(self.indices) + len(self.pictures)
+
+    def __getitems__(self, positions: Sequence[int]) -> RawBatch:
+        """Return the batch of these pairs and pictures."""
+        count = len(self.indices)
+        rows = [position - count for position in positions if position >= count]
+        batch = super().__getitems__([position for position in positions if position < count])
+        if not rows:
+            return batch
+        images, depths = map(torch.from_numpy, self.pictures.read(rows))
+        unmeasured = torch.zeros(depths.shape, dtype=torch.int16)  # torch joins no unsigned numbers of 16 bits
+        stored = torch.cat([batch["stored_depth"].view(torch.int16), unmeasured])
+        batch["image"] = torch.cat([batch["image"], images])
+        batch["stored_depth"] = stored.view(torch.uint16)
+        batch["index"] = torch.cat([batch["index"], torch.tensor(rows) + len(self.store)])
+        batch["teacher_m"] = torch.cat([batch["teacher_m"], depths])
+        return batch
+
+    def pair_id(self, index: int) -> str:
+        """Return the id of the pair, or the picture, that a batch calls ``index``."""
+        beyond = index - len(self.store)
+        return super().pair_id(index) if beyond < 0 else self.pictures.ids[beyond]
+
+    def order(self, *, block: int | None, seed: int, rank: int, world_size: int) -> Sampler[int]:
+        """Return the shuffled positions of an epoch; ConfigError if they are to be in blocks."""
+        if block is not None:
+            raise ConfigError("data.shuffle_block: pictures are not in the store. Pass data.shuffle_block=null.")
+        return super().order(block=None, seed=seed, rank=rank, world_size=world_size)
 
 
 class DeviceDataset(StoreDataset):
@@ -89,8 +139,21 @@ class DeviceDataset(StoreDataset):
         return RawBatch(image=image, stored_depth=depth.view(torch.uint16), index=rows, per_m=self.store.per_m)
 
 
-def on_device(pairs: StoreDataset, device: torch.device) -> StoreDataset:
-    """Return the pairs in a device's memory if they take less than half of what is free there, else as they are."""
+def stored_pairs(store: DepthStore, split: Split, *, teacher: Path | None, pictures: Path | None) -> StoreDataset:
+    """Return the training pairs of a store with a teacher's depths and further pictures, folders that may be None."""
+    if teacher is None:
+        return StoreDataset(store, split.train)
+    pairs = StoreDataset(store, split.train, teacher=TeacherDepths(teacher, store, split.train))
+    return pairs if pictures is None else PicturedDataset(pairs, Pictures(pictures, teacher, store, split))
+
+
+def on_device(pairs: Pairs, device: torch.device) -> Pairs | DeviceDataset:
+    """Return the pairs in a device's memory if they take less than half of what is free there, else as they are.
+
+    Pairs that are generated or have a teacher stay as they are.
+    """
+    if not isinstance(pairs, StoreDataset) or pairs.teacher is not None:
+        return pairs
     needed = len(pairs) * math.prod(pairs.store.size) * 5  # 3 bytes of image, 2 of depth
     free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else math.inf
     try:

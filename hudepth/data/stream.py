@@ -53,6 +53,10 @@ class StreamDataset(Dataset[RawBatch]):
             per_m=values_per_metre(self.source),
         )
 
+    def pair_id(self, index: int) -> str:
+        """Return the id of the pair of this number."""
+        return self.source.generated(index).id
+
     def order(self, *, block: int | None, seed: int, rank: int, world_size: int) -> NewEachEpoch:
         """Return the numbers of an epoch, shuffled within ``SCENES_AT_ONCE`` blocks; a block is a scene by default.
 

@@ -20,7 +20,7 @@ INCIDENTAL = (*LABELS, *SURROUNDINGS)
 """Keys in which two configurations of the same training may differ."""
 SEEDS = ("seed", "data.seed")
 """Keys in which repetitions of a configuration differ. Not ``data.split_seed``, which makes another test set."""
-RESUMABLE = (*SURROUNDINGS, "trainer", "callbacks", "distill.teacher")
+RESUMABLE = (*SURROUNDINGS, "trainer", "callbacks", "distill.teacher", "distill.pictures")
 """Keys that may change when a run is resumed; everything else is fixed by its checkpoint and its split."""
 
 

@@ -99,7 +99,7 @@ def build_datamodule(training: Training) -> DepthDataModule:
     """Prepare the data, and check the protocols of the final test while nothing is lost yet."""
     config, trust = training.config, training.options.trust
     distill = config.get("distill") or {}
-    teacher = {"teacher": distill["teacher"]} if has_target(distill) else {}
+    teacher = {key: distill.get(key) for key in ("teacher", "pictures")} if has_target(distill) else {}
     data = build_data({**config["data"], **teacher}, trust=trust, augment=config.get("augment"))
     if data.source.name == "rooms":
         real = "hudepth-data download data=nyu_labeled_mat data.root=nyu"

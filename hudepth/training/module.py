@@ -200,8 +200,8 @@ class DepthModule(LightningModule):
             )
 
     def _where(self, step: _Step) -> str:
-        name = getattr(getattr(self.trainer, "datamodule", None), "training_id", str)
-        names = ", ".join(map(name, step.rows.tolist()))
+        pairs = getattr(getattr(self.trainer, "datamodule", None), "training_pairs", None)
+        names = ", ".join(map(getattr(pairs, "pair_id", str), step.rows.tolist()))
         number = self.current_epoch * int(self.trainer.num_training_batches) + step.batch_idx + 1
         return f"in epoch {self.current_epoch + 1}, batch {step.batch_idx} (step {number}), of the pairs {names}"
 

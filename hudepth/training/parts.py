@@ -85,6 +85,7 @@ def build_schedule(
 def build_distillation(config: Mapping[str, Any], *, trust: list[str]) -> Any:
     """Build the distance from a teacher's depths; None without. Raises ConfigError if there is no teacher."""
     distill = dict(config.get("distill") or {})
+    distill.pop("pictures", None)  # like the teacher, read by the data module
     if has_target(distill) and not distill.pop("teacher", None):
         raise ConfigError("distill.teacher is not set. Pass distill.teacher=<folder of depths>, or distill=none.")
     return instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None

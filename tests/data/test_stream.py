@@ -88,7 +88,7 @@ def test_nothing_of_the_stream_is_stored(tmp_path: Path) -> None:
     assert len(epoch(data, 0)) == 3
     assert {path: path.stat().st_size for path in tmp_path.iterdir()} == before
     assert len(data.store) == 8
-    assert data.training_id(13) == "further_room_0000006/01"
+    assert data.training_pairs.pair_id(13) == "further_room_0000006/01"
 
 
 def test_files_cannot_be_streamed(tmp_path: Path) -> None:

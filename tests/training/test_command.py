@@ -226,8 +226,9 @@ RECIPE = (
         ("schedule=cosine",),
         RECIPE,
         (*RECIPE, "data.num_workers=2", "trainer.accumulate_grad_batches=2"),
+        ("schedule=cosine", "data.stream=4"),
     ],
-    ids=["plain", "strong", "workers"],
+    ids=["plain", "strong", "workers", "stream"],
 )
 @pytest.mark.slow
 def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(

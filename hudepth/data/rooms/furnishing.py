@@ -101,17 +101,17 @@ class FurnishedRoom:
         for _ in range(int(rng.integers(8))):
             self._put_at_wall(picture(rng))
         flat = [
-            (part, place)
-            for part, *place in self.placed
-            if part.kind == BOX and 0.25 < part.y[1] < 1.4 and min(np.ptp(part.x), np.ptp(part.z)) > 0.2
+            placed
+            for placed in self.placed
+            if (part := placed[0]).kind == BOX and 0.25 < part.y[1] < 1.4 and min(np.ptp(part.x), np.ptp(part.z)) > 0.2
         ]
         for _ in range(int(rng.integers(most)) if flat else 0):
-            part, place = flat[int(rng.integers(len(flat)))]
+            part, x0, z0, yaw = flat[int(rng.integers(len(flat)))]
             (x, z), y = (rng.uniform(*span) for span in (part.x, part.z)), part.y[1]
             width, height, depth = np.exp(rng.uniform(np.log(0.03), np.log([0.18, 0.3, 0.18])))
             kind = int(rng.choice([BOX, BOX, CYLINDER, ELLIPSOID]))
             spans = around(x, width), (y - 0.01, y + height), around(z, width if kind == CYLINDER else depth)
-            self.placed.append((Part(str(rng.choice(_LOOSE)), *spans, kind), *place))
+            self.placed.append((Part(str(rng.choice(_LOOSE)), *spans, kind), x0, z0, yaw))
 
     def _put(self, piece: Piece, x: float, z: float, yaw: float, *, gap: float = 0.03) -> bool:
         """Place a piece with the middle of its back at x, z, if its space is free and inside the room."""

@@ -200,14 +200,19 @@ def _expose(linear: F32, view: View, rng: np.random.Generator, look: Look) -> ND
     step = np.minimum(linear * np.float32(2048), np.float32(4095)).astype(np.int16)
     image: F32 = _tone_curve()[step.transpose(1, 2, 0)]
     if look.blur:
-        image = cv2.GaussianBlur(image, (0, 0), 0.01 + look.blur * image.shape[0] * rng.random())
+        sigma = 0.01 + look.blur * image.shape[0] * rng.random()
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32)
     image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(rng.uniform(*look.noise))
-    values = np.clip(image, 0, 255).astype(np.uint8)
+    return _store(np.clip(image, 0, 255).astype(np.uint8), rng, look)
+
+
+def _store(image: NDArray[np.uint8], rng: np.random.Generator, look: Look) -> NDArray[np.uint8]:
+    """Change an image as the software of a camera does: another tone curve, and compression."""
     if look.contrast != (1.0, 1.0):
         curve = 255 * np.linspace(0, 1, 256) ** rng.uniform(*look.contrast)
-        values = curve.astype(np.uint8)[values]
+        image = curve.astype(np.uint8)[image]
     if look.jpeg_quality is not None:
         quality = int(rng.uniform(*look.jpeg_quality))
-        encoded = cv2.imencode(".jpg", values, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        values = cv2.imdecode(encoded, cv2.IMREAD_COLOR).astype(np.uint8, copy=False)
-    return values
+        encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        image = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
+    return image

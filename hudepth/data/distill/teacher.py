@@ -16,7 +16,6 @@ from hudepth.base.console import track
 from hudepth.base.errors import DataError
 from hudepth.base.files import written_whole
 from hudepth.data.prepare import MAX_SIZES, build_once
-from hudepth.data.sources.base import Record
 from hudepth.data.sources.contents import hash_contents
 from hudepth.data.sources.decoding import read_depth
 from hudepth.data.sources.files import PerProcess
@@ -44,7 +43,7 @@ class TeacherDepths:
             raise DataError(f"distill.teacher: no folder '{root}'. Pass distill.teacher=<folder of npy or png files>.")
         rows = sorted(indices)
         records = [store.records[index] for index in rows]
-        files = _find(root, records)
+        files = find_depths(root, [record.id for record in records], what="training pairs")
         self._position = {index: position for position, index in enumerate(rows)}
         self.size = store.size
         key = [store.path.name, hash_contents("teacher", files, cache=store.path.parent), rows]
@@ -61,13 +60,13 @@ class TeacherDepths:
         return depths
 
 
-def _find(root: Path, records: Sequence[Record]) -> list[Path]:
-    """Return the file of each record."""
-    candidates = ([root / f"{record.id}{ending}" for ending in ENDINGS] for record in records)
+def find_depths(root: Path, ids: Sequence[str], *, what: str) -> list[Path]:
+    """Return the file of each id; DataError if one has none, which says ``what`` the ids name."""
+    candidates = ([root / f"{each}{ending}" for ending in ENDINGS] for each in ids)
     files = [next(filter(Path.is_file, paths), None) for paths in candidates]
-    if missing := [record.id for record, file in zip(records, files, strict=True) if file is None]:
+    if missing := [each for each, file in zip(ids, files, strict=True) if file is None]:
         raise DataError(
-            f"distill.teacher: {len(missing)} of {len(records)} training pairs have no depth in '{root}', the first is "
+            f"distill.teacher: {len(missing)} of {len(ids)} {what} have no depth in '{root}', the first is "
             f"'{missing[0]}': no {missing[0]}.npy or .png. Predict them with hudepth-predict, or copy them there."
         )
     return [file for file in files if file]
@@ -79,18 +78,18 @@ def _prepare(files: Sequence[Path], store: DepthStore, path: Path) -> None:
     with written_whole(path) as part, h5py.File(part, "w", libver="latest") as out:
         depths = out.create_dataset("depth", (len(files), height, width), "f4", chunks=(1, height, width))
         for row, file in enumerate(track(files, total=len(files), what="reading the teacher's depths")):
-            depth = _read(file)
+            depth = read_teacher(file)
             if depth.shape not in native and len(native) < MAX_SIZES:  # else the store names some of them only
                 sizes = " or ".join(f"{h} x {w}" for h, w in sorted(native, reverse=True)[:3])
                 raise DataError(
                     f"distill.teacher: '{file}' is {depth.shape[0]} x {depth.shape[1]}, but the images are {sizes} "
                     "(height x width). Resize it to its image."
                 )
-            depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
             depths[row] = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
-def _read(file: Path) -> NDArray[np.float32]:
+def read_teacher(file: Path) -> NDArray[np.float32]:
+    """Read a depth map [H, W], 0 where it is not finite or not positive; DataError if the file is none."""
     try:
         depth = read_depth(file)
     except DataError:
@@ -101,4 +100,5 @@ def _read(file: Path) -> NDArray[np.float32]:
             f"distill.teacher: '{file}' is not a depth map: a .npy of numbers [height, width], "
             "or a 16-bit grey .png [mm]."
         )
-    return depth.astype(np.float32) / np.float32(1 if file.suffix == ".npy" else 1000)
+    values = depth.astype(np.float32) / np.float32(1 if file.suffix == ".npy" else 1000)
+    return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))

@@ -20,11 +20,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hudepth.base.errors import DataError
-from hudepth.data import prepare, teacher
+from hudepth.data import prepare
 from hudepth.data.dataset import StoreDataset
+from hudepth.data.distill import teacher
+from hudepth.data.distill.teacher import ENDINGS, TeacherDepths
 from hudepth.data.sources.base import Record
 from hudepth.data.store import DepthStore, StoreWriter
-from hudepth.data.teacher import ENDINGS, TeacherDepths
 
 N, SIZE, NATIVE = 5, (4, 6), (8, 12)
 
@@ -137,13 +138,13 @@ def test_files_are_read_once(store: DepthStore, folder: Path, monkeypatch: pytes
     lay(folder, depths)
     first = TeacherDepths(folder, store, [3, 1])
     read: list[Path] = []
-    real = teacher._read
+    real = teacher.read_teacher
 
     def spy(file: Path) -> NDArray[np.float32]:
         read.append(file)
         return real(file)
 
-    monkeypatch.setattr(teacher, "_read", spy)
+    monkeypatch.setattr(teacher, "read_teacher", spy)
     again = TeacherDepths(folder, store, [1, 3])  # the same pairs
     assert again.path == first.path
     assert again.path.parent == store.path.parent
