@@ -37,6 +37,7 @@ EVALUATION_BATCH = 4
 MAX_WORKERS = 1024
 """Loader and preparing processes at most; more would only take the memory of the machine."""
 _WORKERS = Annotated[int, Range(1, MAX_WORKERS)]
+_ON_DEVICE = Annotated[str, Choice(("auto", "true", "false"))]
 
 
 class DepthDataModule(LightningDataModule):
@@ -103,8 +104,7 @@ class DepthDataModule(LightningDataModule):
         self.max_depth_m: float = convert("data.max_depth_m", max_depth_m, Annotated[float, Range(0, above=True)])
         self.batch_size: int = convert("data.batch_size", batch_size, _COUNT)
         self.num_workers: int = convert("data.num_workers", num_workers, Annotated[int, Range(0, MAX_WORKERS)])
-        choices = Annotated[str, Choice(("auto", "true", "false"))]
-        self.on_device: str = convert("data.on_device", str(on_device).lower(), choices)
+        self.on_device: str = convert("data.on_device", str(on_device).lower(), _ON_DEVICE)
         self.prepare_workers: int | None = convert("data.prepare_workers", prepare_workers, _WORKERS | None)
         self.shuffle_block: int | None = convert("data.shuffle_block", shuffle_block, _COUNT | None)
         self.stream: int | None = convert("data.stream", stream, _COUNT | None)
