@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from experiments.speed.mobile_unet import MobileUNet
 from hudepth.base.machine import set_float32_products
+from hudepth.bench.graphs import GraphRunner
 from hudepth.bench.torch_runners import TorchRunner
 from hudepth.bench.worker import Spec
 from hudepth.models.cost import image_flops, parameters
@@ -96,6 +97,17 @@ PEERS = {
     "MobileNet UNet": Peer(lambda _size: MobileUNet(), (224, 224), 32, package=None),
 }
 """By name; GLPN was published with MiT-b4, and with b0 it is the smallest of its kind."""
+
+
+def in_openvino(spec: Spec) -> GraphRunner:
+    """Run a peer in OpenVINO, in float32; the options are those of :class:`PeerRunner`."""
+    library: Any = importlib.import_module("openvino")
+    size: Size = spec.options["size"]
+    net = PEERS[spec.options["peer"]].build(size).eval().requires_grad_(requires_grad=False)
+    graph = library.convert_model(net, example_input=torch.zeros(1, 3, *size), input=[("image", [-1, 3, *size])])
+    settings = {"INFERENCE_NUM_THREADS": spec.threads, "INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
+    request = library.Core().compile_model(graph, "CPU", settings).create_infer_request()
+    return GraphRunner(lambda images: np.array(request.infer({0: images}, share_inputs=True)[0]))
 
 
 class PeerRunner(TorchRunner):

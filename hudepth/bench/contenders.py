@@ -30,6 +30,8 @@ class Contenders:
     workers: list[Worker] = field(default_factory=list)
     """Those that were built."""
     started: list[tuple[Worker, Entry]] = field(default_factory=list)
+    _graphs: dict[str, tuple[str, Subject]] = field(default_factory=dict)
+    """What must be exported for a contender: the graph, and the network."""
     _stack: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> Contenders:
@@ -40,25 +42,30 @@ class Contenders:
             worker.dismiss()
         self._stack.close()
 
-    def enter(self, backends: Sequence[str]) -> None:
-        """Start the processes of :data:`hudepth.bench.backends.BACKENDS`; what is lacking is a note."""
-        subject = self.subject
-        for name in backends:
-            backend = BACKENDS[name]
+    def enter(self, backends: Sequence[str], *, rival: Subject | None = None) -> None:
+        """Start the processes of :data:`hudepth.bench.backends.BACKENDS`; what is lacking is a note.
+
+        They run a ``rival`` instead of the subject if one is given, whose file lies in a folder of its own.
+        """
+        subject = rival or self.subject
+        for backend_name in backends:
+            backend = BACKENDS[backend_name]
+            name = f"{rival.name}, {backend_name}" if rival else backend_name
             if line := lacking(backend, self.device):
                 self.note(name, line)
                 continue
-            options = {**self._network_options(), "precision": backend.precision, **backend.options}
+            options = {**self._network_options(subject), "precision": backend.precision, **backend.options}
             if backend.provider:
                 options["provider"] = backend.provider
             if backend.graph is not None:
-                options["graph"] = str(self.folder / backend.graph)
+                options["graph"] = str(subject.state.parent / backend.graph)
+                self._graphs[name] = (backend.graph, subject)
             yardstick: str | None = "float32"
             if self.device == "cuda":  # what runs on the CPU has none there
-                yardstick = backend.precision if name in ON_GPU else None
+                yardstick = backend.precision if backend_name in ON_GPU else None
             entry = Entry(
                 name, name, subject.size, backend.about, subject.parameters, subject.flops,
-                precision=backend.precision, yardstick=yardstick,
+                kind="peer" if rival else "backend", precision=backend.precision, yardstick=yardstick,
             )  # fmt: skip
             self.start(entry, backend.factory, options)
 
@@ -71,8 +78,8 @@ class Contenders:
         """Build one after the other; yield after each. What cannot be built is a note."""
         for worker, entry in self.started:
             try:
-                if entry.name in BACKENDS and (graph := BACKENDS[entry.name].graph):
-                    self._make_graph(graph)
+                if entry.name in self._graphs:
+                    self._make_graph(*self._graphs[entry.name])
                 described = worker.build()
             except ContenderError as error:
                 worker.close()
@@ -88,21 +95,21 @@ class Contenders:
         worker.build()
         return worker
 
-    def _make_graph(self, name: str) -> Path:
+    def _make_graph(self, name: str, subject: Subject) -> Path:
         """Return a graph's file; it is made if it does not exist."""
-        path, subject = self.folder / name, self.subject
+        path = subject.state.parent / name
         if not path.exists():
             info = {"graph": str(path), "name": subject.name, "max_depth_m": subject.max_depth_m}
-            options = {**self._network_options(), **info}
+            options = {**self._network_options(subject), **info}
             if name != ONNX:
-                options["onnx"] = str(self._make_graph(ONNX))
+                options["onnx"] = str(self._make_graph(ONNX, subject))
             with self._worker(name, GRAPHS[name], options) as maker:
                 maker.build()
         return path
 
-    def _network_options(self) -> dict[str, Any]:
-        shared = {key: getattr(self.subject, key) for key in ("model", "trust", "size")}
-        return {**shared, "state": str(self.subject.state), "device": self.device}
+    def _network_options(self, subject: Subject) -> dict[str, Any]:
+        shared = {key: getattr(subject, key) for key in ("model", "trust", "size")}
+        return {**shared, "state": str(subject.state), "device": self.device}
 
     def _worker(
         self, name: str, factory: str, options: dict[str, Any], *, size: tuple[int, int] | None = None
