@@ -123,7 +123,7 @@ def test_every_command_composes(command: str) -> None:
 
 def place(command: str) -> tuple[bool, int]:
     """Return when to run a command: last if it needs what another one of its page makes."""
-    needs = "resume=" in command or "depths=photos_depth" in command
+    needs = any(word in command for word in ("resume=", "depths=photos_depth", "distill.teacher=taught"))
     return needs, next((i for i, task in enumerate(ORDER) if f"hudepth-{task}" in command), 9)
 
 

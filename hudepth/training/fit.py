@@ -176,7 +176,7 @@ def log_start(trainer: Trainer, module: DepthModule, data: DepthDataModule) -> N
     log.info(
         "%s: %s parameters; %s, split %s: %d train, %d val, %d test; batch %d%s, %s, %d threads",
         type(module.net).__name__, f"{sum(p.numel() for p in module.net.parameters()):,}", data.source.name,
-        split.kind, len(split.train), len(split.val), len(split.test),
+        split.kind, len(data.training_pairs), len(split.val), len(split.test),
         data.batch_size, f" in each of {world} processes" if world > 1 else "",
         type(trainer.accelerator).__name__.removesuffix("Accelerator"), torch.get_num_threads(),
     )  # fmt: skip

@@ -106,3 +106,20 @@ def test_on_a_gpu_each_has_the_yardstick_of_its_precision(
     assert options["onnxruntime_cuda"]["provider"] == "CUDAExecutionProvider"
     assert options["fp16"]["precision"] == "float16"
     assert options["fp16"]["replayed"]
+
+
+def test_a_rival_runs_its_own_network_in_the_same_backends(entered: Contenders, tmp_path: Path) -> None:
+    (tmp_path / "rival").mkdir()
+    rival = Subject("Rival", {"width": 3}, [], tmp_path / "rival" / "state.pt", (32, 48), 10.0, 4, 5, 6)
+    with entered as contenders:
+        contenders.enter(["eager", "openvino"])
+        contenders.enter(["eager", "openvino"], rival=rival)
+        kinds = {entry.name: (entry.kind, entry.size, entry.parameters) for _, entry in contenders.started}
+        options = {worker.name: worker.spec.options for worker, _ in contenders.started}
+        assert sum(1 for _ in contenders.build()) == 4
+    own, other = ("backend", (224, 320), 1), ("peer", (32, 48), 4)
+    assert kinds == {"eager": own, "openvino": own, "Rival, eager": other, "Rival, openvino": other}
+    assert options["Rival, eager"]["model"] == {"width": 3}
+    assert options["Rival, eager"]["state"] == str(tmp_path / "rival" / "state.pt")
+    assert options["Rival, openvino"]["graph"] == str(tmp_path / "rival" / "model.onnx")
+    assert options["openvino"]["graph"] == str(tmp_path / "model.onnx")

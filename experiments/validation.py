@@ -1,0 +1,86 @@
+"""Compare checkpoints on the validation pairs of their split, with 95 % intervals over scenes.
+
+    python -m experiments.validation name=<run> name=<run> ... [--protocol eigen] [--output FILE]
+
+Choices are made on these pairs, so that the test images are looked at once. All checkpoints must have the same data,
+size and split. Prints a Markdown table; the last columns are paired differences from the first checkpoint.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from hudepth.base.errors import ConfigError, HudepthError
+from hudepth.data.datamodule import DepthDataModule
+from hudepth.evaluation.protocols import build_protocols
+from hudepth.evaluation.routine import Evaluation
+from hudepth.evaluation.score import run_evaluation
+from hudepth.evaluation.scoring import image_table
+from hudepth.evaluation.test_data import open_data
+from hudepth.metrics.bootstrap import intervals, paired_differences
+from hudepth.metrics.summary import summarise
+from hudepth.models.inference import inference_form
+from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
+
+SHOWN = ("abs_rel", "rmse", "delta1", "scale_sd", "abs_rel_aligned")
+
+
+def validation_data(checkpoints: Mapping[str, Checkpoint]) -> DepthDataModule:
+    """Return the data of the checkpoints with the validation pairs in the test's place."""
+    opened = {name: open_data(checkpoint, {}, trust=[])[0] for name, checkpoint in checkpoints.items()}
+    first, *others = opened.values()
+    for name, other in zip(list(opened)[1:], others, strict=True):
+        if (other.split.sha256, other.size) != (first.split.sha256, first.size):
+            raise ConfigError(f"{name}: another split or size than {next(iter(opened))}.")
+    first.split = replace(first.split, test=first.split.val)
+    return first
+
+
+def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -> list[str]:
+    """Return the lines of the table."""
+    data = validation_data(checkpoints)
+    stated = next(iter(checkpoints.values())).config["protocol"]
+    if protocol not in stated:
+        raise ConfigError(f"--protocol {protocol}: the first checkpoint was trained with {', '.join(stated)}.")
+    (chosen,) = build_protocols({protocol: stated[protocol]}, datamodule=data, trust=[])
+    nets = {name: inference_form(each.build_net(trust=[]), size=data.size) for name, each in checkpoints.items()}
+    evaluation = Evaluation(nets, [chosen], max_depth_m=data.max_depth_m)
+    run_evaluation(evaluation, data, {"accelerator": "cpu"})
+    records = [data.store.records[index] for index in evaluation.indices]
+    tables = {name: image_table(chosen, evaluation.sums[name, chosen.name], records) for name in nets}
+    first, *_ = tables.values()
+    lines = [f"| | {' | '.join(SHOWN)} | abs_rel | delta1 |", f"|---|{'---|' * (len(SHOWN) + 2)}"]
+    for name, table in tables.items():
+        values, ranges = summarise(table, **chosen.summary_options), intervals(table, **chosen.summary_options)
+        cells = [f"{values[key]:.3f} ({ranges[key][0]:.3f} to {ranges[key][1]:.3f})" for key in SHOWN]
+        change = paired_differences(first, table, **chosen.summary_options)
+        for key in ("abs_rel", "delta1"):
+            each = change[key]
+            cells.append("" if table is first else f"{each.value:+.3f} ({each.low:+.3f} to {each.high:+.3f})")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    scenes = len({record.scene for record in records})
+    return [*lines, "", f"{len(records)} validation images of {scenes} scenes, {chosen.name} protocol."]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="+", help="name=<checkpoint or run directory>")
+    parser.add_argument("--protocol", default="eigen")
+    parser.add_argument("--output", type=Path)
+    options = parser.parse_args()
+    named = dict(each.split("=", 1) for each in options.checkpoints)
+    lines = compare({name: load_checkpoint(path) for name, path in named.items()}, protocol=options.protocol)
+    print("\n".join(lines))
+    if options.output:
+        options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except HudepthError as error:
+        sys.exit(f"validation: {error}")
