@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from torch import nn
+
 from hudepth.base.errors import ConfigError, HudepthError
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.protocols import build_protocols
@@ -22,7 +24,7 @@ from hudepth.evaluation.score import run_evaluation
 from hudepth.evaluation.scoring import image_table
 from hudepth.evaluation.test_data import open_data
 from hudepth.metrics.bootstrap import intervals, paired_differences
-from hudepth.metrics.summary import summarise
+from hudepth.metrics.summary import ImageTable, summarise
 from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 
@@ -40,30 +42,50 @@ def validation_data(checkpoints: Mapping[str, Checkpoint]) -> DepthDataModule:
     return first
 
 
+class Validation:
+    """The validation pairs of checkpoints, and a protocol that the first was trained with.
+
+    Raises ConfigError if it was not, or the checkpoints have different data.
+    """
+
+    def __init__(self, checkpoints: Mapping[str, Checkpoint], *, protocol: str) -> None:
+        self.data = validation_data(checkpoints)
+        stated = next(iter(checkpoints.values())).config["protocol"]
+        if protocol not in stated:
+            raise ConfigError(f"--protocol {protocol}: the first checkpoint was trained with {', '.join(stated)}.")
+        (self.protocol,) = build_protocols({protocol: stated[protocol]}, datamodule=self.data, trust=[])
+
+    def score(self, nets: Mapping[str, nn.Module]) -> dict[str, ImageTable]:
+        """Return the metrics of each image by name of the network."""
+        fast = {name: inference_form(net, size=self.data.size) for name, net in nets.items()}
+        evaluation = Evaluation(fast, [self.protocol], max_depth_m=self.data.max_depth_m)
+        run_evaluation(evaluation, self.data, {"accelerator": "cpu"})
+        records = [self.data.store.records[index] for index in evaluation.indices]
+        key = self.protocol.name
+        return {name: image_table(self.protocol, evaluation.sums[name, key], records) for name in nets}
+
+    def summarise(self, table: ImageTable) -> dict[str, float]:
+        """Return the metrics of all images."""
+        return summarise(table, **self.protocol.summary_options)
+
+
 def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -> list[str]:
     """Return the lines of the table."""
-    data = validation_data(checkpoints)
-    stated = next(iter(checkpoints.values())).config["protocol"]
-    if protocol not in stated:
-        raise ConfigError(f"--protocol {protocol}: the first checkpoint was trained with {', '.join(stated)}.")
-    (chosen,) = build_protocols({protocol: stated[protocol]}, datamodule=data, trust=[])
-    nets = {name: inference_form(each.build_net(trust=[]), size=data.size) for name, each in checkpoints.items()}
-    evaluation = Evaluation(nets, [chosen], max_depth_m=data.max_depth_m)
-    run_evaluation(evaluation, data, {"accelerator": "cpu"})
-    records = [data.store.records[index] for index in evaluation.indices]
-    tables = {name: image_table(chosen, evaluation.sums[name, chosen.name], records) for name in nets}
+    validation = Validation(checkpoints, protocol=protocol)
+    tables = validation.score({name: each.build_net(trust=[]) for name, each in checkpoints.items()})
+    options = validation.protocol.summary_options
     first, *_ = tables.values()
     lines = [f"| | {' | '.join(SHOWN)} | abs_rel | delta1 |", f"|---|{'---|' * (len(SHOWN) + 2)}"]
     for name, table in tables.items():
-        values, ranges = summarise(table, **chosen.summary_options), intervals(table, **chosen.summary_options)
+        values, ranges = validation.summarise(table), intervals(table, **options)
         cells = [f"{values[key]:.3f} ({ranges[key][0]:.3f} to {ranges[key][1]:.3f})" for key in SHOWN]
-        change = paired_differences(first, table, **chosen.summary_options)
+        change = paired_differences(first, table, **options)
         for key in ("abs_rel", "delta1"):
             each = change[key]
             cells.append("" if table is first else f"{each.value:+.3f} ({each.low:+.3f} to {each.high:+.3f})")
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    scenes = len({record.scene for record in records})
-    return [*lines, "", f"{len(records)} validation images of {scenes} scenes, {chosen.name} protocol."]
+    scenes = len(set(first.scenes))
+    return [*lines, "", f"{len(first.ids)} validation images of {scenes} scenes, {protocol} protocol."]
 
 
 def main() -> None:
