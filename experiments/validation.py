@@ -1,6 +1,6 @@
 """Compare checkpoints on the validation pairs of their split, with 95 % intervals over scenes.
 
-    python -m experiments.validation name=<run> name=<run> ... [--protocol eigen] [--output FILE]
+    python -m experiments.validation name=<run> name=<run> ... [--protocol eigen] [--page README.md]
 
 Choices are made on these pairs, so that the test images are looked at once. All checkpoints must have the same data,
 size and split. Prints a Markdown table; the last columns are paired differences from the first checkpoint.
@@ -17,6 +17,7 @@ from pathlib import Path
 from torch import nn
 
 from hudepth.base.errors import ConfigError, HudepthError
+from hudepth.base.files import write_between
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.protocols import build_protocols
 from hudepth.evaluation.routine import Evaluation
@@ -92,13 +93,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="+", help="name=<checkpoint or run directory>")
     parser.add_argument("--protocol", default="eigen")
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--page", type=Path, help="a Markdown page; the table goes between its markers")
+    parser.add_argument("--marker", default="results", help="name of the markers")
     options = parser.parse_args()
     named = dict(each.split("=", 1) for each in options.checkpoints)
     lines = compare({name: load_checkpoint(path) for name, path in named.items()}, protocol=options.protocol)
     print("\n".join(lines))
-    if options.output:
-        options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if options.page:
+        write_between(options.page, options.marker, "\n".join(lines))
 
 
 if __name__ == "__main__":
