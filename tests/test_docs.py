@@ -38,7 +38,7 @@ ORDER = ("train", "test", "export", "predict", "data", "report", "bench", "demo"
 """Of the commands, so that each finds what it needs."""
 
 SMALL = [
-    "data.size=[32,48]", "trainer.max_epochs=1", "trainer.accelerator=cpu", "data.batch_size=2", "callbacks.panels=0",
+    "data.size=[32,64]", "trainer.max_epochs=1", "trainer.accelerator=cpu", "data.batch_size=2", "callbacks.panels=0",
     "logger=none", "trainer.limit_train_batches=1", "trainer.limit_val_batches=1", "data.fractions=[0.6,0.2,0.2]",
 ]  # fmt: skip
 """Appended to training commands: the same commands, in seconds."""
@@ -94,7 +94,7 @@ def shortened(command: str) -> list[str]:
     if words[0] != "hudepth-train" or {"--help", "--cfg"} & set(words) or "resume=" in command:
         return words
     rooms = [] if "data=" in command else ["data.source.scenes=6", "data.source.size=[48,64]"]
-    weights = ["model.weights=none"] if re.search("experiment=(badcl|strong|pretrain)", command) else []
+    weights = ["model.weights=none"] if re.search("experiment=(badcl|strong|pretrain|lite)", command) else []
     small = [word for word in SMALL if word != "logger=none" or "logger=" not in command]
     return [w for w in words if not w.startswith("trainer.max_epochs")] + small + rooms + weights
 

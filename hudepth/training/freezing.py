@@ -19,18 +19,20 @@ class FreezeEncoder(Callback):
     Args:
         until: share of the epochs, in (0, 1]; 1 freezes them throughout. Raises ConfigError if out of range.
         stages: names of the encoder's first stages, without a gap: gradients must pass through what comes after.
+            None freezes all of them.
     """
 
-    def __init__(self, *, until: float = 0.3, stages: Sequence[str] = ("stem", "layer1")) -> None:
+    def __init__(self, *, until: float = 0.3, stages: Sequence[str] | None = ("stem", "layer1")) -> None:
         if not 0 < until <= 1:
             raise ConfigError(f"FreezeEncoder.until: {until} is not a share of the epochs, in (0, 1].")
-        self.until, self.stages = until, list(stages)
+        self.until, self.stages = until, None if stages is None else list(stages)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Freeze before a strategy looks for what it has to share among processes; raise ConfigError if it cannot."""
         if stage != "fit":
             return
         known = [stage.name for stage in _encoder(pl_module).stages]
+        self.stages = known if self.stages is None else self.stages
         if not self.stages or self.stages != known[: len(self.stages)]:
             raise ConfigError(
                 f"FreezeEncoder.stages: {self.stages} are not the first stages of the encoder. Pass the first few of "
@@ -43,7 +45,8 @@ class FreezeEncoder(Callback):
             )
         if self.until < 1 and (trainer.max_epochs or -1) < 0:
             raise ConfigError("FreezeEncoder.until: a share of the epochs needs trainer.max_epochs; or pass until=1.")
-        _encoder(pl_module).freeze(len(self.stages))
+        self._count = len(self.stages)
+        _encoder(pl_module).freeze(self._count)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Freeze as in the epoch that is resumed: Lightning skips the hook below in the first one after a resume."""
@@ -53,7 +56,7 @@ class FreezeEncoder(Callback):
         """Train the stages again, if it is time."""
         if self.until < 1:
             frozen = trainer.current_epoch < round(self.until * (trainer.max_epochs or 0))
-            _encoder(pl_module).freeze(len(self.stages), frozen=frozen)
+            _encoder(pl_module).freeze(self._count, frozen=frozen)
 
 
 def _encoder(pl_module: Any) -> Encoder:

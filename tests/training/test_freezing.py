@@ -91,17 +91,18 @@ def stage_of(name: str) -> str:
         (0.5, ("stem", "layer1"), 4, 2),
         (0.3, ("stem",), 3, 1),
         (1.0, STAGES, 2, 2),
+        (1.0, None, 2, 2),
         (0.1, ("stem", "layer1", "layer2"), 2, 0),  # a share that rounds to no epoch
     ],
 )
 def test_first_stages_stay_as_they_are_until_their_share_is_over(
-    cache: Path, until: float, stages: Sequence[str], epochs: int, frozen: int
+    cache: Path, until: float, stages: Sequence[str] | None, epochs: int, frozen: int
 ) -> None:
     torch.manual_seed(0)
     net = Net()
     watch = fit(cache, FreezeEncoder(until=until, stages=stages), net, epochs=epochs)
     names = [name for name, _ in net.named_parameters()]
-    kept = {name for name in names if stage_of(name) in stages}
+    kept = {name for name in names if stage_of(name) in (stages or STAGES)}
     assert any(name.startswith("encoder.bn1") for name in kept)
     for epoch, (before, after) in enumerate(zip(watch.states, watch.states[1:], strict=False)):
         still = kept if epoch < frozen else set()
