@@ -58,12 +58,12 @@ class Validation:
 
     def score(self, nets: Mapping[str, nn.Module]) -> dict[str, ImageTable]:
         """Return the metrics of each image by name of the network."""
-        fast = {name: inference_form(net, size=self.data.size) for name, net in nets.items()}
+        fast = {f"{i}": inference_form(net, size=self.data.size) for i, net in enumerate(nets.values())}  # no dots
         evaluation = Evaluation(fast, [self.protocol], max_depth_m=self.data.max_depth_m)
         run_evaluation(evaluation, self.data, {"accelerator": "cpu"})
         records = [self.data.store.records[index] for index in evaluation.indices]
-        key = self.protocol.name
-        return {name: image_table(self.protocol, evaluation.sums[name, key], records) for name in nets}
+        sums = [evaluation.sums[i, self.protocol.name] for i in fast]
+        return {name: image_table(self.protocol, each, records) for name, each in zip(nets, sums, strict=True)}
 
     def summarise(self, table: ImageTable) -> dict[str, float]:
         """Return the metrics of all images."""

@@ -34,7 +34,7 @@ def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
 @pytest.mark.parametrize(
     ("task", "arguments", "message"),
     [
-        ("train", ["model.headz=3"], "no key 'model.headz'. Did you mean 'model.attention_heads'? See"),
+        ("train", ["model.attention_headz=3"], "no key 'model.attention_headz'. Did you mean 'model.attention_heads'?"),
         ("train", ["trainer.max_epoch=3"], "no key 'trainer.max_epoch'. Did you mean 'trainer.max_epochs'? See"),
         ("train", ["loss=silog", "loss.variance_focuss=1"], "no key 'loss.variance_focuss'. Did you mean "),
         ("test", ["checkpoint=x", "model=hybrid_unet"], "no key 'model'. See hudepth-test --cfg job for all keys."),

@@ -201,6 +201,16 @@ def test_the_results_are_those_of_the_run() -> None:
         assert shown == [f"{values[key]:.3f}" for key in ("abs_rel", "rmse", "log10", "delta1", "delta2", "delta3")]
 
 
+def test_what_is_said_of_the_network_for_cpus_was_measured() -> None:
+    studies = ROOT / "experiments"
+    values = json.loads((studies / "lite_official" / "test" / "eigen" / "metrics.json").read_text())["metrics"]["model"]
+    said = ", ".join(f"{name} {values[name]:.3f}" for name in ("abs_rel", "rmse", "delta1"))
+    page = (studies / "speed" / "lite" / "bench.md").read_text()
+    faster = re.search(r"lite is ([\d.]+) \(.*\) times as fast as HybridUNet in openvino", page)
+    assert faster
+    assert f"has {said}, and {faster[1]} times the speed in OpenVINO" in README
+
+
 def test_the_speeds_are_those_of_the_benchmark() -> None:
     speed = ROOT / "experiments" / "speed"
     table = runpy.run_path(str(speed / "inference_table.py"))["table"]

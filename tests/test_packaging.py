@@ -17,7 +17,10 @@ from PIL import Image
 from tests.commands import TINY
 
 ROOT = Path(__file__).parents[1]
-SHIPPED = ("hudepth/", "conf/", "experiments/strong_official/nyu/", "pyproject", "README", "LICENSE")
+SHIPPED = (
+    "hudepth/", "conf/", "experiments/strong_official/nyu/", "experiments/lite_official/nyu_lite/", "pyproject",
+    "README", "LICENSE",
+)  # fmt: skip
 UNTESTED = ("ray",)
 """Extras that no test installs."""
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -51,8 +54,11 @@ def test_the_wheel_holds_every_module_and_configuration(site: Path) -> None:
 
 def test_the_wheel_brings_a_model(site: Path) -> None:
     held = {str(path.relative_to(site / "hudepth/pretrained")) for path in (site / "hudepth/pretrained").rglob("*.*")}
-    assert {"nyu/config.json", "nyu/model.safetensors", "nyu/README.md", "nyu/metrics/eigen.json"} < held
-    assert (site / "hudepth" / "pretrained" / "nyu" / "model.safetensors").stat().st_size < 10_000_000
+    for name in ("nyu", "nyu_lite"):
+        assert {
+            f"{name}/{file}" for file in ("config.json", "model.safetensors", "README.md", "metrics/eigen.json")
+        } < held
+        assert (site / "hudepth" / "pretrained" / name / "model.safetensors").stat().st_size < 10_000_000
 
 
 def wheel_command(site: Path, task: str, *arguments: str, cwd: Path) -> subprocess.Popen[str]:

@@ -50,7 +50,8 @@ def start_rivals(contenders: Contenders, plan: Plan) -> None:
     for name in SMALL:
         size = PEERS[name].nearest(contenders.subject.size)
         for backend, factory in FACTORIES.items():
-            entry = Entry(f"{name}, {backend}", f"{name}, {backend}", size, kind="peer")
+            label, about = f"{name}, {backend}", f"random weights, {backend}, float32"
+            entry = Entry(label, label, size, about, kind="peer")
             options = {"peer": name, "size": size, "device": contenders.device}
             contenders.start(entry, f"experiments.speed.peers:{factory}", options)
 

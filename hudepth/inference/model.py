@@ -170,9 +170,9 @@ def load(
     """Load a model to predict with.
 
     Args:
-        spec: ``nyu`` (the bundled pretrained model), ``hf:owner/name`` (from the Hugging Face Hub), a checkpoint, run
-            directory, bundle (folder or zip), exported ``.onnx``, ``.xml`` or ``.pt2`` file, or ``last`` for the newest
-            run.
+        spec: ``nyu`` or ``nyu_lite`` (bundled pretrained models), ``hf:owner/name`` (from the Hugging Face Hub), a
+            checkpoint, run directory, bundle (folder or zip), exported ``.onnx``, ``.xml`` or ``.pt2`` file, or
+            ``last`` for the newest run.
         backend: what runs an exported file: ``onnxruntime``, ``openvino``, ``torch``, or ``auto``.
         device: ``cpu``, ``cuda``, ``mps``, or ``auto`` (a GPU if there is one); for checkpoints only.
         precision: ``float32``, or faster but not exact: ``bfloat16`` on an NVIDIA GPU or in OpenVINO, ``float16`` on an

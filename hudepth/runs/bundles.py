@@ -22,15 +22,16 @@ from hudepth.base.verbs import shipped
 
 CONFIG, WEIGHTS, ONNX, CARD = "config.json", "model.safetensors", "model.onnx", "README.md"
 KIND = "hudepth-bundle"
-PRETRAINED = ("nyu",)
-"""Names of the bundled pretrained models for ``checkpoint=``: ``nyu``, from ``experiments/strong_official``."""
+PRETRAINED = {"nyu": "strong_official", "nyu_lite": "lite_official"}
+"""The bundled pretrained models by their names for ``checkpoint=``, each with the folder of ``experiments`` it is from:
+``nyu``, the paper's network, and ``nyu_lite``, the network for CPUs."""
 MAX_CONFIG_BYTES = 1 << 22
 MAX_WEIGHTS_BYTES = 1 << 32
 
 
 def pretrained(name: str) -> Path:
     """Return the folder of one of :data:`PRETRAINED`. Raises CheckpointError if this installation lacks it."""
-    folder = shipped(f"pretrained/{name}", f"experiments/strong_official/{name}")
+    folder = shipped(f"pretrained/{name}", f"experiments/{PRETRAINED[name]}/{name}")
     if not is_bundle(folder):
         fix = "Install hudepth again, or pass a run or a file."
         raise CheckpointError(f"checkpoint: the weights of '{name}' are not part of this installation. {fix}")
