@@ -40,7 +40,7 @@ class Pictures:
         split: of the store. The images of its validation and test pairs may not be among the pictures.
 
     Raises DataError if there are none, one cannot be read, one has no depth of its size, or one is a duplicate of an
-    image that is held out, exact or near (:func:`hudepth.data.audit.duplicates.hash_images`).
+    image that is held out, exact or near, by perceptual hash.
     """
 
     def __init__(self, folder: str | Path, teacher: str | Path, store: DepthStore, split: Split) -> None:
