@@ -76,7 +76,7 @@ def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -
     tables = validation.score({name: each.build_net(trust=[]) for name, each in checkpoints.items()})
     options = validation.protocol.summary_options
     first, *_ = tables.values()
-    lines = [f"| | {' | '.join(SHOWN)} | abs_rel | delta1 |", f"|---|{'---|' * (len(SHOWN) + 2)}"]
+    lines = [f"| | {' | '.join(SHOWN)} | change of abs_rel | change of delta1 |", f"|---|{'---|' * (len(SHOWN) + 2)}"]
     for name, table in tables.items():
         values, ranges = validation.summarise(table), intervals(table, **options)
         cells = [f"{values[key]:.3f} ({ranges[key][0]:.3f} to {ranges[key][1]:.3f})" for key in SHOWN]
