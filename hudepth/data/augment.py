@@ -30,7 +30,8 @@ class Augmentation:
 
     Args:
         flip: probability of swapping left and right.
-        zoom: range of the crop's enlargement, at least 1; its logarithm is uniform. The crop lies anywhere.
+        zoom: range of the crop's enlargement; its logarithm is uniform. The crop lies anywhere. Below 1 the whole image
+            is shrunk instead, as a wider lens shows it, and lies anywhere; around it nothing is measured.
         zoom_chance: probability of zooming at all; otherwise the whole image is used.
         zoom_depth: divide depth by the zoom, as a fixed camera would see it.
         rotate_deg: largest roll of the camera, either way [degrees]; at most 45.
@@ -47,7 +48,7 @@ class Augmentation:
     """
 
     flip: _Share = 0.0
-    zoom: Annotated[Sequence[float], Range(1, 8), "[lowest,highest] within 1 and 8"] = (1.0, 1.0)
+    zoom: Annotated[Sequence[float], Range(0.5, 8), "[lowest,highest] within 0.5 and 8"] = (1.0, 1.0)
     zoom_chance: _Share = 1.0
     zoom_depth: bool = True
     rotate_deg: Annotated[float, Range(0, 45)] = 0.0

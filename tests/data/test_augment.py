@@ -451,6 +451,20 @@ def test_what_comes_with_the_truth_is_moved_as_it_is(seed: int) -> None:
     assert (moved[:, 0] / 2).equal(moved[:, 1])
 
 
+@given(seed=st.integers(0, 1000), zoom=st.floats(0.5, 0.95))
+def test_below_1_the_whole_image_is_shown_smaller_and_farther_away(seed: int, zoom: float) -> None:
+    size = (48, 64)
+    moved, depth = run(Augmentation(zoom=(zoom, zoom)), coordinates(1, size), torch.ones(1, 1, *size), seed=seed)
+    seen = depth[0, 0] > 0
+    assert seen.float().mean().item() == pytest.approx(zoom**2, abs=0.05)
+    torch.testing.assert_close(depth[0, 0][seen], torch.full_like(depth[0, 0][seen], 1 / zoom))
+    inside = moved[0, :2][:, seen]  # where each pixel comes from: all of the image
+    assert inside.min().item() < -0.95
+    assert inside.max().item() > 0.95
+    step = moved[0, 0].diff(dim=1)[seen[:, 1:] & seen[:, :-1]].median().item()
+    assert step == pytest.approx(2 / (zoom * size[1]), rel=1e-3)
+
+
 @given(seed=st.integers(0, 1000), low=st.floats(1.0, 2.0), more=st.floats(1.0, 2.0))
 def test_depth_is_divided_by_the_zoom_unless_it_shall_not_be(seed: int, low: float, more: float) -> None:
     image, depth = pair(seed, count=1)
@@ -603,7 +617,7 @@ def test_what_is_within_the_border_is_all_seen() -> None:
     "options",
     [
         {"flip": 1.5}, {"flip": -0.1}, {"grey": math.nan}, {"cut_depth": 2}, {"cut_depth_size": 1.01}, {"tint": 0.6},
-        {"noise": math.inf}, {"blur": 3.5}, {"rotate_deg": 90}, {"border": 0.45}, {"zoom": [0.5, 2.0]},
+        {"noise": math.inf}, {"blur": 3.5}, {"rotate_deg": 90}, {"border": 0.45}, {"zoom": [0.4, 2.0]},
         {"zoom": [1.0, 9.0]}, {"gamma": (2.0, 1.0)}, {"brightness": [-1.0, 1.0]}, {"contrast": [1.0]},
         {"saturation": [math.nan, 1.0]},
     ],
