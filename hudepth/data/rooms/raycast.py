@@ -57,11 +57,11 @@ def camera_axes(*, yaw: float, pitch: float, roll: float) -> F64:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def pinhole_view(origin: F64, axes: F64, *, height: int, width: int) -> View:
-    """Return the rays through all pixel centres of NYU's camera at ``height`` x ``width``."""
+def pinhole_view(origin: F64, axes: F64, *, height: int, width: int, zoom: float = 1.0) -> View:
+    """Return the rays through all pixel centres of NYU's camera at ``height`` x ``width``, its focal length zoomed."""
     camera = Intrinsics.of_nyu(height, width)
-    xs = ((np.arange(width) - camera.cx) / camera.fx).astype(np.float32)
-    ys = ((np.arange(height) - camera.cy) / camera.fy).astype(np.float32)
+    xs = ((np.arange(width) - camera.cx) / (zoom * camera.fx)).astype(np.float32)
+    ys = ((np.arange(height) - camera.cy) / (zoom * camera.fy)).astype(np.float32)
     return View(origin, axes, xs, ys)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.camera.intrinsics import Intrinsics
+from hudepth.base.camera.intrinsics import NYU_FOCAL, Intrinsics
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.base.options import Broadcast, Choice, Range, convert
 from hudepth.data.rooms.fittings import CATEGORIES
@@ -28,6 +29,9 @@ MAX_PAIRS = 1_000_000
 _FURTHER = "further_room_"
 _COUNT = Annotated[int, Range(1)]
 _SIZE = Annotated[tuple[int, int], Range(16, 2048), Broadcast(), "[height,width], each from 16 to 2048"]
+_FOV = Annotated[tuple[float, float], Range(20, 120), "[lowest,highest] within 20 and 120 degrees"]
+_CAMERA = (0, 1)
+"""Ends the seed of a room's camera, which is longer than any other seed."""
 _TEST_FRACTION = 0.2
 _BASELINE_M = 0.075
 _KINECT_RANGE_M = 8.0
@@ -42,11 +46,14 @@ class RoomsSource(Source):
 
     Args:
         scenes: number of rooms. The last fifth (at least one room of two) is the ``test`` split.
-        size: (height, width) in pixels, each 16 to 2048; the field of view is always NYU's.
+        size: (height, width) in pixels, each 16 to 2048.
         seed: at least 0; each seed gives other rooms.
         variety: ``usual``; ``wide``: more sizes of rooms, fuller, seen from more distances, heights and angles, so
             that depths are distributed more as in NYU Depth V2; or ``homes``: as ``wide``, with loose things
             everywhere, mixed light and a worse camera.
+        fov_deg: lowest and highest horizontal field of view [degrees] of the rooms' cameras; None is always NYU's. A
+            picture looks as if NYU's camera had seen everything nearer or farther away, and this is the depth it has:
+            the true one times NYU's focal length over its own, as a zoomed crop has (:mod:`hudepth.data.transforms`).
         holes: remove depth (0) where a Kinect would not measure: in its projector's shadow, on grazing and
             dark surfaces, beyond 8 m, along the border, and in blobs. Everything else stays the same.
 
@@ -67,6 +74,7 @@ class RoomsSource(Source):
         size: int | Sequence[int] = (240, 320),
         seed: int = 0,
         variety: str = "usual",
+        fov_deg: Sequence[float] | None = None,
         holes: bool = False,
     ) -> None:
         self.scenes: int = convert("data.source.scenes", scenes, _COUNT)
@@ -79,6 +87,9 @@ class RoomsSource(Source):
         self.size: tuple[int, int] = convert("data.source.size", size, _SIZE)
         self.seed: int = convert("data.source.seed", seed, Annotated[int, Range(0)])
         self.variety: str = convert("data.source.variety", variety, Annotated[str, Choice(tuple(VARIETIES))])
+        self.fov_deg = None if fov_deg is None else convert("data.source.fov_deg", fov_deg, _FOV)
+        if self.fov_deg is not None and self.fov_deg[0] > self.fov_deg[1]:
+            raise ConfigError(f"data.source.fov_deg: {list(self.fov_deg)} is not [lowest,highest]. Pass [45,75].")
         self.holes: bool = convert("data.source.holes", holes, bool)
 
     @property
@@ -105,19 +116,28 @@ class RoomsSource(Source):
         scene = self._scene_number(record)
         room = build_room(self.seed, scene, self.variety)
         height, width = self.size
-        view = pinhole_view(*room.path.pose(record.frame), height=height, width=width)
+        zoom = self._zoom(scene)
+        view = pinhole_view(*room.path.pose(record.frame), height=height, width=width, zoom=zoom)
         frame_seed = np.random.SeedSequence([self.seed, scene, record.frame])
         image, depth = render(room.scene, view, np.random.default_rng(frame_seed))
         if self.holes:
             rng = np.random.default_rng(frame_seed.spawn(1)[0])
-            depth[kinect_holes(depth, image, fx=self.intrinsics.fx, rng=rng)] = 0
-        return RawPair(image, depth)
+            depth[kinect_holes(depth, image, fx=zoom * self.intrinsics.fx, rng=rng)] = 0
+        return RawPair(image, depth if zoom == 1 else (depth / zoom).astype(np.float32))
 
     def fingerprint(self) -> str:
         """sha256 over the records, everything else the frames depend on, and the renderer's version."""
-        variety = [] if self.variety == "usual" else [self.variety]
-        options = json.dumps([super().fingerprint(), self.size, self.seed, self.holes, RENDERER_VERSION, *variety])
+        further = [] if self.variety == "usual" else [self.variety]
+        further += [] if self.fov_deg is None else [f"fov_deg={list(self.fov_deg)}"]
+        options = json.dumps([super().fingerprint(), self.size, self.seed, self.holes, RENDERER_VERSION, *further])
         return hashlib.sha256(options.encode()).hexdigest()
+
+    def _zoom(self, scene: int) -> float:
+        """Return the focal length of a room's camera over that of NYU's."""
+        if self.fov_deg is None:
+            return 1.0
+        rng = np.random.default_rng([self.seed, scene, *_CAMERA])
+        return 0.5 / NYU_FOCAL[0] / math.tan(math.radians(rng.uniform(*self.fov_deg)) / 2)
 
     def _record(self, scene: int, frame: int) -> Record:
         tests = max(1, round(_TEST_FRACTION * self.scenes))

@@ -19,8 +19,8 @@ from torch.nn import functional
 class Geometry:
     """How each image of a batch is cropped, rolled and flipped; see :func:`warp`.
 
-    ``zoom`` enlarges the crop, and below 1 shrinks the image; ``centre`` is its x and y, where [-1, 1] spans the image; ``angle`` is the
-    roll of the camera [radians], clockwise; ``flip`` swaps left and right.
+    ``zoom`` enlarges the crop, and below 1 shrinks the image; ``centre`` is its x and y, where [-1, 1] spans the image;
+    ``angle`` is the roll of the camera [radians], clockwise; ``flip`` swaps left and right.
     """
 
     zoom: Float[Tensor, " b"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hudepth.base.camera.intrinsics import Intrinsics
 from hudepth.base.errors import ConfigError, DataError
 from hudepth.data.rooms.raycast import BOX, CYLINDER, F64, ROOM_FACES, Solids, View, pinhole_view, trace
 from hudepth.data.rooms.scene import build_room
@@ -58,6 +59,21 @@ def test_a_single_scene_has_no_split() -> None:
     assert {record.split for record in RoomsSource(scenes=1).records()} == {""}
 
 
+def test_each_room_has_a_camera_of_its_own() -> None:
+    source = RoomsSource(scenes=200, frames_per_scene=2, fov_deg=(45, 75))
+    zooms = np.array([source._zoom(scene) for scene in range(200)])
+    degrees = 2 * np.degrees(np.arctan(320 / (zooms * 518.857901)))
+    assert 45 <= degrees.min() < 46
+    assert 74 < degrees.max() <= 75
+    assert degrees.mean() == pytest.approx(60, abs=2)  # three standard errors
+
+
+@pytest.mark.parametrize("fov_deg", [[75, 45], [10, 45], [45, 170], [45]])
+def test_an_impossible_field_of_view_is_refused(fov_deg: Any) -> None:
+    with pytest.raises(ConfigError, match=r"data\.source\.fov_deg"):
+        RoomsSource(fov_deg=fov_deg)
+
+
 # Determinism
 
 
@@ -95,6 +111,8 @@ def test_the_fingerprint_covers_all_that_changes_a_frame(monkeypatch: pytest.Mon
         RoomsSource(size=SMALL, holes=True),
         RoomsSource(size=SMALL, scenes=47),
         RoomsSource(size=SMALL, frames_per_scene=6),
+        RoomsSource(size=SMALL, fov_deg=[45, 75]),
+        RoomsSource(size=SMALL, fov_deg=[45, 70]),
     ]
     prints = [source.fingerprint() for source in (base, *others)]
     assert len(set(prints)) == len(prints)
@@ -154,23 +172,28 @@ def test_depth_agrees_with_one_ray_at_a_time(index: int) -> None:
     assert (~close).sum() <= 1  # a ray that grazes a silhouette may fall on either side of it
 
 
-def test_the_floor_back_projects_to_a_plane() -> None:
-    source = RoomsSource(size=(96, 128))
-    camera = source.intrinsics
+@pytest.mark.parametrize("fov_deg", [None, 45.0, 75.0])
+def test_the_floor_back_projects_to_a_plane(fov_deg: float | None) -> None:
+    source = RoomsSource(size=(96, 128), fov_deg=None if fov_deg is None else (fov_deg, fov_deg))
+    nyu = Intrinsics.of_nyu(96, 128)
+    focal = nyu.fx if fov_deg is None else 64 / math.tan(math.radians(fov_deg / 2))
+    camera = replace(nyu, fx=focal, fy=nyu.fy * focal / nyu.fx)
+    seen = 0
     for index in (0, 6):
         record = source.records()[index]
         room = build_room(0, index // 5)
         origin, axes = room.path.pose(record.frame)
-        view = pinhole_view(origin, axes, height=96, width=128)
+        view = pinhole_view(origin, axes, height=96, width=128, zoom=focal / nyu.fx)
         _, surface = trace(view, room.scene.room_size, room.scene.solids)
-        z = source.read(record).depth.astype(np.float64)
+        z = source.read(record).depth.astype(np.float64) * focal / nyu.fx
         v, u = np.mgrid[:96, :128]
         points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1) @ axes + origin
         floor = surface == 2
-        assert floor.sum() > 100
+        seen += floor.sum()
         np.testing.assert_allclose(points[floor][:, 1], 0, atol=1e-4)
         assert (points > -1e-4).all()
         assert (points < room.scene.room_size + 1e-4).all()
+    assert seen > 100
 
 
 # What the rooms are like
