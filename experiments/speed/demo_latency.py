@@ -2,9 +2,9 @@
 
     python -m experiments.speed.demo_latency [folder of images] [--pictures 40] [--page README.md]
 
-A headless Chromium uploads pictures to the demo, one after the other, to one model and the other in turns. Timed is what
-a visitor waits: from choosing the file to the depth map on the page, which includes the upload, decoding, prediction,
-sending the depth and drawing it. Prints a Markdown table; --page writes it between the page's ``demo`` marks.
+A headless Chromium uploads pictures to the demo, one after the other, to each model in turns. Timed is what a visitor
+waits: from choosing the file to the depth map on the page, which includes the upload, decoding, prediction, sending the
+depth and drawing it. Prints a Markdown table; --page writes it between the page's ``demo`` marks.
 """
 
 from __future__ import annotations

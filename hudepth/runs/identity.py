@@ -44,8 +44,12 @@ def is_below(key: str, names: tuple[str, ...]) -> bool:
 
 
 def run_key(config: Mapping[str, Any]) -> str:
-    """Return 10 hexadecimal digits that are equal for configurations of equal :func:`identity`."""
-    text = json.dumps({key: _normalise(value) for key, value in identity(config).items()}, sort_keys=True, default=str)
+    """Return 10 hexadecimal digits that are equal for configurations of equal :func:`identity`.
+
+    A key that is null counts as absent, so that a run is not trained again when a later version has a further option.
+    """
+    values = {key: _normalise(value) for key, value in identity(config).items() if value is not None}
+    text = json.dumps(values, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 

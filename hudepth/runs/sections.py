@@ -41,6 +41,7 @@ class _Config:
     protocol: Part | None = None
     augment: Part | None = None
     distill: Part | None = None
+    auxiliary: Part | None = None
     paths: Part = field(default_factory=dict)
     monitor: str = ""
     name: str | None = None

@@ -35,7 +35,7 @@ from hudepth.training.initial import Parents, Training, network_before, restore_
 from hudepth.training.loggers.run import log_tests, open_loggers
 from hudepth.training.module import DepthModule
 from hudepth.training.options import memory_format
-from hudepth.training.parts import build_distillation, build_optimizer, build_schedule
+from hudepth.training.parts import build_auxiliary, build_distillation, build_optimizer, build_schedule
 from hudepth.training.trainer import build_callbacks, build_run_trainer, one_ending
 
 
@@ -164,6 +164,7 @@ def build_module(
         max_depth_m=datamodule.max_depth_m,
         optimizer=optimizer,
         distill=build_distillation(config, trust=trust),
+        auxiliary=build_auxiliary(config, trust=trust),
         scheduler=schedule if has_target(config["schedule"]) else None,
         record={"config": dict(config), "split": datamodule.split.summary(), "data": data},
         cuda_graph=bool(config.get("cuda_graph", True)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
@@ -19,8 +20,9 @@ from hudepth.base.errors import ConfigError, TrainingError
 from hudepth.base.types import Batch
 from hudepth.cuda import graphs
 from hudepth.cuda.steps import StepGraphs
+from hudepth.losses.auxiliary import AuxiliaryHeads
 from hudepth.losses.distillation import Distillation
-from hudepth.metrics.collection import validation_metrics, validation_names
+from hudepth.metrics.collection import validation_metrics
 from hudepth.runs import checkpoint as ckpt
 from hudepth.training.averaging import averaged_state
 from hudepth.training.means import EpochMeans, Sums
@@ -59,6 +61,7 @@ class DepthModule(LightningModule):
         scheduler: makes a schedule from an optimiser and the total number of steps: a :class:`StepSchedule` advances
             after every step, others after every epoch. None for a constant rate.
         distill: distance from a teacher's depths, added to the loss of training batches that have them.
+        auxiliary: heads that only training has; their losses are added to that of training batches.
         record: plain values stored in each checkpoint, for example ``config``.
         cuda_graph: replay steps on a GPU where they can be recorded; see :class:`hudepth.cuda.steps.StepGraphs`.
     """
@@ -72,11 +75,13 @@ class DepthModule(LightningModule):
         optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
         scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
         distill: Distillation | None = None,
+        auxiliary: AuxiliaryHeads | None = None,
         record: dict[str, Any] | None = None,
         cuda_graph: bool = True,
     ) -> None:
         super().__init__()
         self.net, self.loss, self.distill, self.max_depth_m = net, loss, distill, max_depth_m
+        self.auxiliary = auxiliary.attach(net) if auxiliary else None
         self.val_metrics = validation_metrics(max_depth_m=max_depth_m, prefix="val/")
         self._make_optimizer, self._make_scheduler = optimizer, scheduler
         self._record = record or {}
@@ -120,18 +125,6 @@ class DepthModule(LightningModule):
         """Log the loss of a batch and add it to the metrics."""
         self._step(batch, "val")
 
-    @torch.inference_mode()
-    def logged_names(self) -> list[str]:
-        """Return the names of everything that is logged for an epoch; calls the loss to learn its terms."""
-        depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
-        try:
-            terms = ["total", *self.loss(depth, depth, image, depth > 0).terms]
-        except (TypeError, AttributeError) as error:  # one of torch's own, which takes two tensors and returns one
-            why = f"{type(self.loss).__name__} is not a loss of depth maps ({error})"
-            raise ConfigError(f"loss: {why}. Pass loss=l1, or write one as docs/extending.md shows.") from error
-        names = [f"val/{name}" for name in validation_names()] + [loss_name("val", term) for term in terms]
-        return names + [loss_name("train", term) for term in terms + ["distill"] * bool(self.distill)]
-
     def _step(self, batch: Batch, stage: str) -> Tensor:
         pred = self(batch.get("small_image", batch["image"]))
         if pred.shape != batch["unit_depth"].shape:  # the loss is computed at full size, whatever size it trains at
@@ -142,6 +135,9 @@ class DepthModule(LightningModule):
         if self.distill is not None and "teacher" in batch:
             terms["distill"] = self.distill(pred, batch["teacher"])
             total = total + self.distill.weight * terms["distill"]
+        if self.auxiliary is not None and stage == "train":
+            further = self.auxiliary(batch["unit_depth"], batch["valid"])
+            total, terms = total + further.total, {**terms, **further.terms}
         values = {loss_name(stage, term): value for term, value in {"total": total, **terms}.items()}
         self._losses[stage].add(values, images=len(pred))  # Lightning's log() would cost a tenth of a small step
         if stage == "val":
@@ -213,7 +209,8 @@ class DepthModule(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, the schedule."""
-        optimizer = self._make_optimizer(self.net.named_parameters())
+        further = self.auxiliary.named_parameters(prefix="auxiliary") if self.auxiliary else ()
+        optimizer = self._make_optimizer(chain(self.net.named_parameters(), further))
         if getattr(getattr(self._trainer, "precision_plugin", None), "scaler", None) is None:
             # Without a scaler fused updates unscale nothing, but Lightning would refuse to clip their gradients.
             optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,9 +14,11 @@ from hudepth.base.errors import ConfigError, did_you_mean
 from hudepth.base.instantiate import find_class, has_target, import_trusted, instantiate
 from hudepth.data.build import build_data
 from hudepth.evaluation.protocols import make_protocols
+from hudepth.losses.auxiliary import AuxiliaryHeads
+from hudepth.metrics.collection import validation_names
 from hudepth.models.build import build_network
 from hudepth.runs.checkpoint import find_checkpoint
-from hudepth.training.module import DepthModule
+from hudepth.training.module import loss_name
 from hudepth.training.optim import GroupedAdamW
 from hudepth.training.options import TrainOptions
 from hudepth.training.schedules import StepSchedule
@@ -31,9 +33,12 @@ def check_parts(config: Mapping[str, Any], options: TrainOptions) -> None:
     trust = options.trust
     import_trusted(trust)
     build_data(config["data"], trust=trust, augment=config.get("augment"))
+    auxiliary = build_auxiliary(config, trust=trust)
     if not trust:  # else it may be of any kind
         with torch.device("meta"):
-            build_network({**config["model"], **({"weights": None} if "weights" in config["model"] else {})})
+            net = build_network({**config["model"], **({"weights": None} if "weights" in config["model"] else {})})
+            if auxiliary:
+                auxiliary.attach(net)
     if options.test:
         make_protocols(config["protocol"], trust=trust)
     if options.init:
@@ -42,11 +47,26 @@ def check_parts(config: Mapping[str, Any], options: TrainOptions) -> None:
     optimizer = build_optimizer(config, [("weight", nn.Parameter(torch.zeros(1)))], encoder=None, trust=trust)
     if has_target(config["schedule"]):
         build_schedule(config, optimizer, total_steps=1, trust=trust)
-    module = DepthModule(nn.Identity(), loss, max_depth_m=1.0, optimizer=lambda _: optimizer, distill=distill)
-    known = module.logged_names()
+    known = logged_names(loss, training=["distill"] * bool(distill) + list(auxiliary.weights if auxiliary else ()))
     if options.monitor not in known:
         hint = did_you_mean(options.monitor, known)
         raise ConfigError(f"monitor: no '{options.monitor}'.{hint} Pass one of {', '.join(known)}.")
+
+
+@torch.inference_mode()
+def logged_names(loss: nn.Module, *, training: Sequence[str] = ()) -> list[str]:
+    """Return the names of everything that is logged for an epoch; calls the loss to learn its terms.
+
+    ``training`` are further terms, which validation does not have. Raises ConfigError if it is no loss of depth maps.
+    """
+    depth, image = torch.full((1, 1, 16, 16), 0.5), torch.zeros(1, 3, 16, 16)
+    try:
+        terms = ["total", *loss(depth, depth, image, depth > 0).terms]
+    except (TypeError, AttributeError) as error:  # one of torch's own, which takes two tensors and returns one
+        why = f"{type(loss).__name__} is not a loss of depth maps ({error})"
+        raise ConfigError(f"loss: {why}. Pass loss=l1, or write one as docs/extending.md shows.") from error
+    names = [f"val/{name}" for name in validation_names()] + [loss_name("val", term) for term in terms]
+    return names + [loss_name("train", term) for term in [*terms, *training]]
 
 
 def build_optimizer(
@@ -89,3 +109,9 @@ def build_distillation(config: Mapping[str, Any], *, trust: list[str]) -> Any:
     if has_target(distill) and not distill.pop("teacher", None):
         raise ConfigError("distill.teacher is not set. Pass distill.teacher=<folder of depths>, or distill=none.")
     return instantiate(distill, trust=trust, only=nn.Module) if has_target(distill) else None
+
+
+def build_auxiliary(config: Mapping[str, Any], *, trust: list[str]) -> Any:
+    """Build the heads that only training has; None without. Raises ConfigError if they cannot be built."""
+    auxiliary = config.get("auxiliary")
+    return instantiate(auxiliary, trust=trust, only=AuxiliaryHeads, key="auxiliary") if has_target(auxiliary) else None

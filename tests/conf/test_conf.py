@@ -40,7 +40,20 @@ def composed(*overrides: str, task: str = "train") -> dict[str, object]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "group",
-    ["data", "model", "augment", "loss", "distill", "optim", "schedule", "trainer", "callbacks", "logger", "protocol"],
+    [
+        "data",
+        "model",
+        "augment",
+        "loss",
+        "distill",
+        "auxiliary",
+        "optim",
+        "schedule",
+        "trainer",
+        "callbacks",
+        "logger",
+        "protocol",
+    ],
 )
 def test_every_choice_of_every_group_composes(group: str) -> None:
     for name in set(names(group)) - {"base"}:

@@ -45,6 +45,12 @@ def test_what_is_trained_does(key: str, value: Any) -> None:
     assert run_key(changed(key, value)) != run_key(CONFIG)
 
 
+def test_a_further_option_that_is_null_does_not_make_another_training() -> None:
+    assert run_key(changed("auxiliary", {"_target_": None})) == run_key(CONFIG)
+    assert run_key(changed("data.fov_deg", None)) == run_key(CONFIG)
+    assert run_key(changed("auxiliary", {"_target_": "x"})) != run_key(CONFIG)
+
+
 def test_one_is_one_however_it_is_written() -> None:
     assert run_key(changed("loss.boundary", 1)) == run_key(changed("loss.boundary", 1.0))
     assert run_key(changed("data.size", [224.0, 224])) == run_key(CONFIG)

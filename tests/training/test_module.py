@@ -21,6 +21,7 @@ from hudepth.metrics.depth import METRIC_NAMES
 from hudepth.models import TinyUNet
 from hudepth.runs.checkpoint import KEY, VERSION
 from hudepth.training.module import DepthModule
+from hudepth.training.parts import logged_names
 
 SECTION_3_5 = {"ssim", "mse", "rmse", "abs_rel", "log10", "delta1", "delta2", "delta3"}
 
@@ -58,7 +59,7 @@ def make_trainer(*callbacks: Callback, **options: Any) -> Trainer:
 
 def test_a_loss_of_another_kind_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"loss: L1Loss is not a loss of depth maps"):
-        make_module(nn.L1Loss()).logged_names()
+        logged_names(nn.L1Loss())
 
 
 def test_what_is_logged(cache: Path) -> None:
