@@ -227,9 +227,8 @@ RECIPE = (
         RECIPE,
         (*RECIPE, "data.num_workers=2", "trainer.accumulate_grad_batches=2"),
         ("schedule=cosine", "data.stream=4"),
-        ("model=lite", "model.weights=none", "data.size=[32,64]", "auxiliary=heads", "callbacks=ema"),
     ],
-    ids=["plain", "strong", "workers", "stream", "auxiliary"],
+    ids=["plain", "strong", "workers", "stream"],
 )
 @pytest.mark.slow
 def test_killed_at_random_moments_and_resumed_it_ends_bit_for_bit_the_same(

@@ -384,3 +384,34 @@ def test_a_teacher_must_be_named(command: Command) -> None:
     done = command("train", *QUIET, "distill=metric", "test=false")
     assert done.code == 1
     assert "distill.teacher" in last_line(done.err)
+
+
+@pytest.mark.slow
+def test_auxiliary_heads_train_and_resume_and_are_no_part_of_the_network(command: Command, tmp_path: Path) -> None:
+    options = (*QUIET, "model=lite", "model.weights=none", "data.size=[32,64]", "auxiliary=heads", "test=false")
+    assert command("train", *options, "name=whole", "trainer.max_epochs=2").code == 0
+    assert command("train", *options, "name=parts", "trainer.max_epochs=1").code == 0
+    parts = only_run(tmp_path, "parts")
+    resumed = command("train", f"resume={parts}", "trainer.max_epochs=2")
+    assert resumed.code == 0, resumed.err
+    whole = only_run(tmp_path, "whole")
+    states = [torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"] for run in (whole, parts)]
+    assert "auxiliary.heads.normals.weight" in states[0]
+    assert states[0].keys() == states[1].keys()
+    assert all(states[0][name].equal(states[1][name]) for name in states[0])
+    for row in rows(whole, "metrics.csv"):
+        terms = {name: float(row[f"train/loss/{name}"]) for name in ("boundary", "smoothness", "scaling")}
+        heads = float(row["train/loss/normals"]) + float(row["train/loss/edges"])
+        total = 3 * terms["boundary"] + 1.2 * terms["smoothness"] + terms["scaling"] + 0.5 * heads
+        assert float(row["train/loss/total"]) == pytest.approx(total, rel=1e-5)
+        assert "val/loss/normals" not in row
+    net = load_checkpoint(str(whole)).build_net(trust=[])
+    assert not [name for name, _ in net.named_parameters() if "heads" in name]
+
+
+def test_auxiliary_heads_need_a_decoder(command: Command) -> None:
+    done = command("train", *QUIET, "auxiliary=heads", "test=false")
+    assert done.code == 1
+    assert last_line(done.err) == (
+        "hudepth-train: auxiliary: TinyUNet has no decoder's map to use. Pass auxiliary=none."
+    )
