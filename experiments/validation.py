@@ -2,8 +2,9 @@
 
     python -m experiments.validation name=<run> name=<run> ... [--protocol eigen] [--page README.md]
 
-Choices are made on these pairs, so that the test images are looked at once. All checkpoints must have the same data,
-size and split. Prints a Markdown table; the last columns are paired differences from the first checkpoint.
+Choices are made on these pairs, so that the test images are looked at once. All checkpoints must have the same data
+and split; each sees images of the size that it was trained at, so only protocols at native resolution compare sizes.
+Prints a Markdown table; the last columns are paired differences from the first checkpoint.
 """
 
 from __future__ import annotations
@@ -72,8 +73,12 @@ class Validation:
 
 def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -> list[str]:
     """Return the lines of the table."""
-    validation = Validation(checkpoints, protocol=protocol)
-    tables = validation.score({name: each.build_net(trust=[]) for name, each in checkpoints.items()})
+    alone = {name: Validation({name: each}, protocol=protocol) for name, each in checkpoints.items()}
+    validation = next(iter(alone.values()))
+    for name, other in alone.items():
+        if other.data.split.sha256 != validation.data.split.sha256:
+            raise ConfigError(f"{name}: another split than {next(iter(alone))}.")
+    tables = {name: alone[name].score({name: each.build_net(trust=[])})[name] for name, each in checkpoints.items()}
     options = validation.protocol.summary_options
     first, *_ = tables.values()
     lines = [f"| | {' | '.join(SHOWN)} | change of abs_rel | change of delta1 |", f"|---|{'---|' * (len(SHOWN) + 2)}"]
