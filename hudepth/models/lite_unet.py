@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hudepth.base.options import convert
+from hudepth.base.options import Range, convert
 from hudepth.models.attention import PooledContext
 from hudepth.models.decoder import Arithmetic, UpsampleMode
 from hudepth.models.efficientnet import EfficientNetLite0Encoder
 from hudepth.models.unet import UNet
 
-WIDTHS = (192, 128, 96, 64)
-"""Channels of the up blocks, from 1/16 to 1/2 of the image's size."""
+_Widths = Annotated[tuple[int, int, int, int], Range(1)]
+WIDTHS = (192, 128, 64, 32)
 
 
 class LiteUpBlock(nn.Module):
@@ -50,12 +50,13 @@ class LiteUpBlock(nn.Module):
 
 
 class LiteUNet(UNet):
-    """One normalised RGB image in, one unit depth map of the same size out; 3,311,617 parameters by default.
+    """One normalised RGB image in, one unit depth map of the same size out; 3,275,457 parameters by default.
 
     Both sides of an image must be multiples of 32. It is no part of the paper, whose future work is a lighter network.
 
     Args:
         weights: of the encoder: ``imagenet``, a path, or ``none`` (see :class:`EfficientNetLite0Encoder`).
+        widths: channels of the four up blocks, from 1/16 to 1/2 of the image's size.
         context: the mean of the deepest map joins each of its positions (:class:`PooledContext`).
         upsample, output, arithmetic, recompute, scale_head: see :class:`hudepth.models.unet.UNet`; ``merged`` concerns
             the head.
@@ -72,6 +73,7 @@ class LiteUNet(UNet):
         self,
         *,
         weights: str | None = None,
+        widths: Sequence[int] = WIDTHS,
         context: bool = True,
         upsample: UpsampleMode = "bilinear",
         output: str = "sigmoid",
@@ -88,7 +90,7 @@ class LiteUNet(UNet):
             arithmetic=arithmetic,
             recompute=recompute,
             scale_head=scale_head,
-            widths=WIDTHS,
+            widths=convert("model.widths", widths, _Widths),
             up_block=LiteUpBlock,
             context=PooledContext(encoder.stages[-1].channels) if context else nn.Identity(),
         )

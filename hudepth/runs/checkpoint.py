@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import re
 import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,18 +78,27 @@ class Checkpoint:
             if sum(tensor.nbytes for tensor in self.state.values()) > self.size_bytes:
                 raise CheckpointError(f"'{self.path}' is refused: its tensors claim more memory than the file holds.")
             with torch.device("meta"):
-                self._check_fits(build_network(model))
+                self._check_fits(build_network(model).state_dict(), self.state)
         net = build_network(model, trust=trust)
         self.fill(net)
         return net.eval()
 
-    def fill(self, net: nn.Module) -> None:
-        """Load the tensors into a network. Raises CheckpointError if they do not fit."""
-        self._check_fits(net)
-        net.load_state_dict(self.state)
+    def fill(self, net: nn.Module, *, skip: Sequence[str] = ()) -> None:
+        """Load the tensors into a network, but not into the parts named in ``skip``, whatever shapes these have.
 
-    def _check_fits(self, net: nn.Module) -> None:
-        own, given = net.state_dict(), self.state
+        Raises CheckpointError if they do not fit, or the network has no such part.
+        """
+        own = net.state_dict()
+        for part in skip:
+            if not any(_is_of(name, [part]) for name in own):
+                parts = ", ".join(name for name, _ in net.named_children())
+                raise CheckpointError(f"init_skip: {type(net).__name__} has no part '{part}'. It has {parts}.")
+        kept = {name: tensor for name, tensor in own.items() if _is_of(name, skip)}
+        given = {name: tensor for name, tensor in self.state.items() if not _is_of(name, skip)}
+        self._check_fits(own, {**kept, **given})
+        net.load_state_dict({**kept, **given})
+
+    def _check_fits(self, own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
         names = {**own, **given}
         misfits = [n for n in names if n not in own or n not in given or own[n].shape != given[n].shape]
         if misfits:
@@ -97,6 +107,11 @@ class Checkpoint:
                 f"{self.config['model'].get('_target_')}, the first is '{misfits[0]}'. "
                 "Pass a checkpoint whose configuration matches its weights."
             )
+
+
+def _is_of(name: str, parts: Sequence[str]) -> bool:
+    """Return whether a tensor belongs to one of a network's parts."""
+    return any(name.startswith(f"{part}.") for part in parts)
 
 
 def find_checkpoint(spec: str, *, runs: str | Path, key: str = "checkpoint") -> Path:

@@ -87,13 +87,16 @@ def network_before(training: Training, *, size: tuple[int, int], max_depth_m: fl
 def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataModule) -> Parents:
     """Load the weights of ``config["init"]`` into a network; return what they were trained on.
 
-    Raises CheckpointError if there is no such checkpoint or it belongs to another network, DataError if it was trained
+    The parts in ``config["init_skip"]`` stay as they are. Raises CheckpointError if there is no such checkpoint or it
+    belongs to another network, DataError if it was trained
     on pairs that this training validates or tests on.
     """
     checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"], key="init")
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))
-    checkpoint.fill(net)
-    log.info("init: weights of '%s', epoch %d", checkpoint.path, checkpoint.epoch)
+    skip = list(config.get("init_skip") or ())
+    checkpoint.fill(net, skip=skip)
+    but = f", but {' and '.join(skip)}" if skip else ""
+    log.info("init: weights of '%s', epoch %d%s", checkpoint.path, checkpoint.epoch, but)
     trained = checkpoint.config.get("data")
     before_m = trained.get("max_depth_m") if isinstance(trained, dict) else None
     if before_m != datamodule.max_depth_m:

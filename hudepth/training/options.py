@@ -124,6 +124,7 @@ class TrainOptions:
     trust: list[str]
     baselines: bool = True
     init: str | None = None
+    init_skip: list[str] = field(default_factory=list)
     memory_format: Literal["auto", "contiguous", "channels_last"] = "auto"
     cuda_graph: bool = True
     compile: bool = False
@@ -134,6 +135,8 @@ class TrainOptions:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", self.name) or ".." in self.name.split("/"):
             raise ConfigError(f"name: '{self.name}' cannot name a folder. Use letters, digits, '.', '_' and '-'.")
+        if self.init_skip and not self.init:
+            raise ConfigError("init_skip: there is no init= of which parts could be left out. Pass init=<run>.")
 
 
 def parse_options(config: Mapping[str, Any]) -> TrainOptions:

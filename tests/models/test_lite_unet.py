@@ -175,6 +175,7 @@ def test_up_block(upsample: str) -> None:
         {"output": "bins"},
         {"arithmetic": "merged", "recompute": True},
         {"encoder_norm": "frozen"},
+        {"widths": (7, 6, 5, 4)},
     ],
 )
 def test_depth_of_the_images_size_and_gradients_everywhere(options: dict[str, Any]) -> None:

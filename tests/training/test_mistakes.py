@@ -49,6 +49,8 @@ MISTAKES = [
     ("monitor=abs_rel", "monitor: no 'abs_rel'. Did you mean 'val/abs_rel'? Pass one of val/abs_rel,"),
     ("mode=mni", "mode: 'mni' is not one of min, max. Did you mean 'min'?"),
     ("init=nuy", "init: no file or run directory 'nuy'. Did you mean 'nyu'? Pass a file"),
+    ("init_skip=[head]", "init_skip: there is no init= of which parts could be left out. Pass init=<run>."),
+    ("model=lite model.widths=[8,8,8]", "model.widths: [8,8,8] is not a list of 4 whole numbers of at least 1."),
     ("protocol=[eigen,papper]", "protocol: no 'papper'. Did you mean 'paper'? Pass one of"),
     ("protocol.eigen.max_depth_m=abc", "protocol.eigen.max_depth_m: 'abc' is not a number"),
     ("callbacks=early_stopping callbacks.early_stopping.patience=abc", "callbacks.early_stopping.patience: 'abc'"),

@@ -219,6 +219,26 @@ def test_training_can_start_from_another_run(command: Command, tmp_path: Path) -
     assert "in shares of" not in done.err
 
 
+@pytest.mark.slow
+def test_parts_that_init_skips_begin_anew_whatever_their_shapes(command: Command, tmp_path: Path) -> None:
+    assert command("train", *QUIET, "name=first", "test=false").code == 0
+    still = ("optim.lr=1e-30", "optim.weight_decay=0", "data.source.seed=5", "test=false", "trainer.max_epochs=1")
+    begun = load_checkpoint(str(only_run(tmp_path, "first")))
+    for name, skip in (("same", "[decode]"), ("all", "[]")):
+        done = command("train", *QUIET, *still, f"name={name}", f"init={begun.path}", f"init_skip={skip}", "seed=3")
+        assert done.code == 0, done.err
+        assert (", but decode" in done.err) is (name == "same")
+        state = load_checkpoint(str(only_run(tmp_path, name))).state
+        assert state["encode.weight"].equal(begun.state["encode.weight"])
+        assert state["decode.weight"].equal(begun.state["decode.weight"]) is (name == "all")
+    wide = (*still, "name=wide", "model.channels=5", f"init={begun.path}")
+    assert command("train", *QUIET, *wide, "init_skip=[encode,norm,decode]").code == 0
+    for skip, line in (("[encode,norm]", "1 tensors do not fit"), ("[head]", "init_skip: TinyUNet has no part 'head'")):
+        done = command("train", *QUIET, *wide, f"init_skip={skip}")
+        assert done.code == 1
+        assert line in last_line(done.err)
+
+
 @pytest.mark.parametrize(("changes", "worse"), [(["optim.lr=3"], True), (["data.max_depth_m=20"], None)])
 def test_the_network_before_training_is_scored_next_to_it(
     changes: list[str], worse: bool | None, command: Command, trained: Path, tmp_path: Path
