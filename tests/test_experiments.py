@@ -197,6 +197,10 @@ def test_what_the_study_of_the_model_that_comes_along_says_of_its_trainings() ->
     assert f"again took {100 * gained:.1f} % off its abs_rel" in text
     assert f"was at validation delta1 {first[38]['val/delta1']:.3f} (epoch 39)" in text
     assert f"to {best[0]['val/delta1']:.3f} at the best abs_rel and to {first[59]['val/delta1']:.3f} after" in text
+    half = read_history(study / "encoder_rate" / "half.csv")
+    faster, slower = (min(row["val/abs_rel"] for row in rows[: len(half)]) for rows in (half, first))
+    assert f"was at validation abs_rel {faster:.3f} at best when it was stopped after {len(half)}" in text
+    assert f"the first training at {slower:.3f} by then" in text
     fifth, last = second[4], second[-1]
     assert f"falls from {fifth['val/abs_rel']:.3f} to {last['val/abs_rel']:.3f}" in text
     assert f"training loss by {100 * (1 - last['train/loss/total'] / fifth['train/loss/total']):.0f} %" in text
