@@ -149,6 +149,16 @@ def test_time_to_accuracy() -> None:
     assert 0 < share < 0.5
 
 
+def test_what_paid_is_what_the_studies_say() -> None:
+    study = STUDIES / "what_paid"
+    text = (study / "README.md").read_text()
+    assert text.split("<!-- table -->\n")[1].strip() == load(study / "table.py").table()
+    assert "3.6 % off" in text
+    assert "took 3.6 % off" in (STUDIES / "strong_official" / "README.md").read_text()
+    flipped, plain = (read_metrics(STUDIES / "protocols", name)["abs_rel"] for name in ("eigen_flip", "eigen"))
+    assert f"[abs_rel {flipped:.3f} instead of {plain:.3f}]" in text
+
+
 def test_equal_budget() -> None:
     study = STUDIES / "equal_budget"
     document = json.loads((study / "compare" / "compare.json").read_text())
@@ -214,6 +224,25 @@ def test_what_the_study_of_the_model_that_comes_along_says_of_its_trainings() ->
     chosen = json.loads((study / "nyu" / "config.json").read_text())["epoch"]
     losses = [row["train/loss/total"] for row in read_history(study / "metrics.csv")]
     assert chosen == len(losses) - 1 == losses.index(min(losses)) + 1  # the last but one
+
+
+def test_what_the_study_of_the_network_for_cpus_says() -> None:
+    study = STUDIES / "lite_official"
+    text = " ".join((study / "README.md").read_text().split())
+    now, flipped, before = (
+        read_metrics(study / folder, protocol)
+        for folder, protocol in ((".", "eigen"), (".", "eigen_flip"), ("second", "eigen"))
+    )
+    said = ", ".join(f"{name} {flipped[name]:.3f}" for name in ("abs_rel", "rmse", "delta1"))
+    assert f"[with the flip](test/eigen_flip/metrics.json): {said})" in text
+    assert f"rmse of all pixels at once is {now['rmse_pooled']:.3f} m" in text
+    paper = read_metrics(STUDIES / "strong_official", "eigen")
+    assert f"(abs_rel {paper['abs_rel']:.3f}, delta1 {paper['delta1']:.3f})" in text
+    edges = [each["edge_f1_0.25"] for each in (now, paper, before)]
+    assert "F1 at 0.25 is {:.3f}, that network's {:.3f}, and that of the second training {:.3f}".format(*edges) in text
+    said_again = json.loads((study / "nyu_lite" / "metrics" / "eigen.json").read_text())["metrics"]["model"]
+    assert said_again["abs_rel"] == now["abs_rel"]
+    assert len(json.loads((study / "scored.json").read_text())) == 1
 
 
 def test_the_estimate_of_long_trainings_follows_from_what_was_measured() -> None:

@@ -36,8 +36,9 @@ def demo(model: str, folder: str) -> Iterator[str]:
     """Serve a model's demo, with its temporary files in a folder, and return the page's address."""
     command = [str(Path(sys.executable).parent / "hudepth-demo"), f"checkpoint={model}", "port=0"]
     process = subprocess.Popen(
-        command, cwd=folder, env={**os.environ, "TMPDIR": folder}, text=True, stdout=subprocess.PIPE
-    )
+        command, cwd=folder, env={**os.environ, "TMPDIR": folder}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
     try:
         assert process.stdout is not None
         for line in process.stdout:

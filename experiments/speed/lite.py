@@ -1,6 +1,6 @@
 """Compare model=lite with the paper's network and with other small networks, in each backend and in one run.
 
-    python -m experiments.speed.lite [--backends eager default openvino int8] [--repeats 9] [--output lite_speed]
+    python -m experiments.speed.lite [--backends openvino int8 ...] [--repeats 9] [--output lite_speed]
 
 Every network has random weights and takes images of 224 x 224, one at a time. Writes what hudepth-bench writes, and
 prints how many times as fast lite is: the median over rounds of the ratio within a round, and the range of the ratios.
@@ -28,7 +28,7 @@ from hudepth.bench.rows import Entry
 from hudepth.bench.subject import make_subject
 
 SMALL = ("GLPN (MiT-b0)", "MobileNet UNet")
-BACKENDS = ("eager", "default", "openvino", "int8")
+BACKENDS = ("eager", "channels_last", "default", "openvino", "int8")
 FACTORIES = {"eager": "PeerRunner", "openvino": "in_openvino"}
 
 

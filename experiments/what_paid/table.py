@@ -1,0 +1,53 @@
+"""Gather what changes of a training were worth, from the studies that measured them, into the table of README.md.
+
+python -m experiments.what_paid.table
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from hudepth.base.files import write_between
+
+HERE = Path(__file__).parent
+STUDIES = HERE.parent
+PAGES = (
+    # study, marker of its table, row, what was changed, where it was measured
+    ("rooms_curve", "results", "wide_8k", "8,192 rooms before real images, `lite`", "validation"),
+    ("rooms_curve", "results", "wide_32k", "32,768 rooms", "validation"),
+    ("rooms_curve", "results", "homes_32k", "32,768 rooms with clutter and a worse camera", "validation"),
+    ("lite_official", "validation", "third", "a narrower decoder and a third cycle, `lite`", "validation"),
+)
+COMPARED = (
+    ("lite_official", "that, and 90 more images in a fourth cycle, `lite`", "test"),
+    ("equal_budget", "`experiment=strong` instead of the paper's recipe, on as many images", "test"),
+)
+
+
+def cells(study: str, marker: str, row: str) -> list[str]:
+    """Return the last two columns of a row in a study's table: the changes of abs_rel and delta1."""
+    table = (STUDIES / study / "README.md").read_text(encoding="utf-8").split(f"<!-- {marker} -->\n")[1]
+    (line,) = [line for line in table.splitlines() if line.startswith(f"| {row} |")]
+    return [cell.strip() for cell in line.split("|")[-3:-1]]
+
+
+def differences(study: str) -> list[str]:
+    """Return the changes of abs_rel and delta1 between two runs that hudepth-report compared."""
+    document = json.loads((STUDIES / study / "compare" / "compare.json").read_text(encoding="utf-8"))
+    rows = [document["metrics"][name] for name in ("abs_rel", "delta1")]
+    return [f"{row['difference']:+.3f} ({row['low']:+.3f} to {row['high']:+.3f})" for row in rows]
+
+
+def table() -> str:
+    """Return the table in Markdown."""
+    lines = ["| change | on | abs_rel | delta1 |", "|---|---|---|---|"]
+    for study, marker, row, change, where in PAGES:
+        lines.append(f"| {change} | [{where}](../{study}) | {' | '.join(cells(study, marker, row))} |")
+    for study, change, where in COMPARED:
+        lines.append(f"| {change} | [{where}](../{study}) | {' | '.join(differences(study))} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    write_between(HERE / "README.md", "table", table())
