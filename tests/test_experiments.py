@@ -240,6 +240,11 @@ def test_what_the_study_of_the_network_for_cpus_says() -> None:
     assert f"(abs_rel {paper['abs_rel']:.3f}, delta1 {paper['delta1']:.3f})" in text
     edges = [each["edge_f1_0.25"] for each in (now, paper, before)]
     assert "F1 at 0.25 is {:.3f}, that network's {:.3f}, and that of the second training {:.3f}".format(*edges) in text
+    scratch = read_history(study / "from_scratch" / "metrics.csv")
+    best = min(row["val/abs_rel"] for row in scratch)
+    assert f"was at validation abs_rel {best:.3f} after {len(scratch)} of 52 epochs" in text
+    losses = [row["train/loss/total"] for row in read_history(study / "metrics.csv")]
+    assert f"lowest training loss, epoch {losses.index(min(losses)) + 1} of {len(losses)}." in text
     said_again = json.loads((study / "nyu_lite" / "metrics" / "eigen.json").read_text())["metrics"]["model"]
     assert said_again["abs_rel"] == now["abs_rel"]
     assert len(json.loads((study / "scored.json").read_text())) == 1
