@@ -53,7 +53,7 @@ class RoomsSource(Source):
             everywhere, mixed light and a worse camera.
         fov_deg: lowest and highest horizontal field of view [degrees] of the rooms' cameras; None is always NYU's. A
             picture looks as if NYU's camera had seen everything nearer or farther away, and this is the depth it has:
-            the true one times NYU's focal length over its own, as a zoomed crop has (:mod:`hudepth.data.transforms`).
+            the true one times NYU's focal length over its own, as a zoomed crop has.
         holes: remove depth (0) where a Kinect would not measure: in its projector's shadow, on grazing and
             dark surfaces, beyond 8 m, along the border, and in blobs. Everything else stays the same.
 
