@@ -22,8 +22,8 @@ COMPOSITIONS = ("experiment", "sweep", "debug")
 SHARED = ("base", "default")
 COMMANDS = ("train", "test", "predict", "data", "report", "export", "bench", "demo")
 GROUPS = (
-    "data", "model", "augment", "loss", "distill", "optim", "schedule", "trainer", "callbacks", "logger", "base",
-    "protocol", *COMPOSITIONS, "hydra/sweeper", "hydra/launcher", "paths",
+    "data", "model", "augment", "loss", "distill", "auxiliary", "optim", "schedule", "trainer", "callbacks", "logger",
+    "base", "protocol", *COMPOSITIONS, "hydra/sweeper", "hydra/launcher", "paths",
 )  # fmt: skip
 """In the order of the page."""
 

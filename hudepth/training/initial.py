@@ -88,8 +88,7 @@ def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataM
     """Load the weights of ``config["init"]`` into a network; return what they were trained on.
 
     The parts in ``config["init_skip"]`` stay as they are. Raises CheckpointError if there is no such checkpoint or it
-    belongs to another network, DataError if it was trained
-    on pairs that this training validates or tests on.
+    belongs to another network, DataError if it was trained on pairs that this training validates or tests on.
     """
     checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"], key="init")
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))

@@ -124,7 +124,7 @@ class TrainOptions:
     trust: list[str]
     baselines: bool = True
     init: str | None = None
-    init_skip: list[str] = field(default_factory=list)
+    init_skip: list[str] | None = None
     memory_format: Literal["auto", "contiguous", "channels_last"] = "auto"
     cuda_graph: bool = True
     compile: bool = False
