@@ -20,9 +20,11 @@ import torch
 from torch import Tensor
 
 from experiments.validation import Validation
-from hudepth.base.errors import HudepthError
+from hudepth.base.errors import ConfigError, HudepthError
+from hudepth.evaluation.lineage import BEFORE, lineage
 from hudepth.metrics.catalogue import metric_info
-from hudepth.runs.checkpoint import KEY, NET_PREFIX, load_checkpoint, read_plain
+from hudepth.runs.bundles import is_bundle
+from hudepth.runs.checkpoint import KEY, NET_PREFIX, Checkpoint, load_checkpoint, read_plain
 
 State = Mapping[str, Tensor]
 
@@ -49,9 +51,23 @@ def greedy(states: Mapping[str, State], scores: Mapping[str, float], score: Call
     return chosen
 
 
+def check(checkpoints: Mapping[str, Checkpoint], output: Path) -> None:
+    """Raise HudepthError, before anything is scored, for checkpoints that cannot be averaged or written."""
+    first, *others = checkpoints.values()
+    shapes = {name: tensor.shape for name, tensor in first.state.items()}
+    for each in others:
+        if {name: tensor.shape for name, tensor in each.state.items()} != shapes:
+            raise ConfigError(f"'{each.path}' is of another network than '{first.path}'.")
+    if bundle := next((each.path for each in checkpoints.values() if is_bundle(each.path)), None):
+        raise ConfigError(f"'{bundle}' is a bundle. Pass the checkpoint that it was made of.")
+    if not output.parent.is_dir():
+        raise ConfigError(f"no folder '{output.parent}' to write the soup to.")
+
+
 def make_soup(output: Path, paths: Sequence[str], *, protocol: str, metric: str) -> list[str]:
     """Write the soup of checkpoints to ``output``; return lines about it."""
     checkpoints = {path: load_checkpoint(path) for path in paths}
+    check(checkpoints, output)
     validation = Validation(checkpoints, protocol=protocol)
     nets = {name: each.build_net(trust=[]) for name, each in checkpoints.items()}
     sign = -1 if metric_info(metric).higher_is_better else 1
@@ -69,6 +85,7 @@ def make_soup(output: Path, paths: Sequence[str], *, protocol: str, metric: str)
     content = read_plain(checkpoints[chosen[0]].path)
     content["state_dict"] = {f"{NET_PREFIX}{name}": tensor for name, tensor in state.items()}
     content[KEY]["soup"] = chosen
+    content[KEY]["data"][BEFORE] = [past for name in chosen for past in lineage(checkpoints[name])][1:]
     torch.save(content, output)
     return [*lines, f"{metric} {sign * score(state):.4f}  {output}, the average of {len(chosen)}"]
 

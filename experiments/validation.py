@@ -14,6 +14,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -45,14 +46,16 @@ def validation_data(checkpoints: Mapping[str, Checkpoint]) -> DepthDataModule:
 
 
 class Validation:
-    """The validation pairs of checkpoints, and a protocol that the first was trained with.
+    """The validation pairs of checkpoints, and a protocol: of those ``stated``, by default by the first checkpoint.
 
-    Raises ConfigError if it was not, or the checkpoints have different data.
+    Raises ConfigError if it is not among them, or the checkpoints have different data.
     """
 
-    def __init__(self, checkpoints: Mapping[str, Checkpoint], *, protocol: str) -> None:
+    def __init__(
+        self, checkpoints: Mapping[str, Checkpoint], *, protocol: str, stated: Mapping[str, Any] | None = None
+    ) -> None:
         self.data = validation_data(checkpoints)
-        stated = next(iter(checkpoints.values())).config["protocol"]
+        stated = stated or next(iter(checkpoints.values())).config["protocol"]
         if protocol not in stated:
             raise ConfigError(f"--protocol {protocol}: the first checkpoint was trained with {', '.join(stated)}.")
         (self.protocol,) = build_protocols({protocol: stated[protocol]}, datamodule=self.data, trust=[])
@@ -73,11 +76,14 @@ class Validation:
 
 def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -> list[str]:
     """Return the lines of the table."""
-    alone = {name: Validation({name: each}, protocol=protocol) for name, each in checkpoints.items()}
+    stated = next(iter(checkpoints.values())).config["protocol"]
+    alone = {name: Validation({name: each}, protocol=protocol, stated=stated) for name, each in checkpoints.items()}
     validation = next(iter(alone.values()))
     for name, other in alone.items():
-        if other.data.split.sha256 != validation.data.split.sha256:
-            raise ConfigError(f"{name}: another split than {next(iter(alone))}.")
+        same = other.data.size == validation.data.size or validation.protocol.needs_native
+        if not same or other.data.split.sha256 != validation.data.split.sha256:
+            what = "split" if same else "size, at which this protocol scores,"
+            raise ConfigError(f"{name}: another {what} than {next(iter(alone))}.")
     tables = {name: alone[name].score({name: each.build_net(trust=[])})[name] for name, each in checkpoints.items()}
     options = validation.protocol.summary_options
     first, *_ = tables.values()

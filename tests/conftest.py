@@ -19,7 +19,10 @@ from tests.commands import TINY, Command, Result
 
 # pep484_tower: an int is welcome where a float is asked for, as in any YAML file
 jaxtyping.install_import_hook("hudepth", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+# One thread for each process, whatever a command asks for: several workers' threads would wait for the same cores.
+os.environ |= {"OMP_NUM_THREADS": "1", "GOMP_SPINCOUNT": "10000"}
 torch.set_num_threads(1)
+torch.set_num_threads = lambda _: None
 # OpenVINO imports absl, whose handler would close the standard error that pytest captures when Hydra resets logging
 absl.logging.get_absl_handler().python_handler.stream = sys.__stderr__
 settings.register_profile("hudepth", deadline=None, max_examples=25)  # a busy machine is no failure

@@ -96,7 +96,13 @@ def shortened(command: str) -> list[str]:
     rooms = [] if "data=" in command else ["data.source.scenes=6", "data.source.size=[48,64]"]
     weights = ["model.weights=none"] if re.search("experiment=(badcl|strong|pretrain|lite)", command) else []
     small = [word for word in SMALL if word != "logger=none" or "logger=" not in command]
-    return [w for w in words if not w.startswith("trainer.max_epochs")] + small + rooms + weights
+    words = [word for word in words if not word.startswith("trainer.max_epochs")]
+    if "+sweep=loss_terms" in words:  # a smaller one
+        words = [word.replace("paper,l1,silog", "paper,l1").replace("1,2,3", "1,2") for word in words]
+        small += ["protocol=eigen", "baselines=false"]
+    elif "experiment=badcl" not in command:  # of which runs are compared
+        small += ["test=false"]
+    return words + small + rooms + weights
 
 
 def check_demo(words: list[str], folder: Path) -> None:

@@ -124,10 +124,15 @@ def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version
         assert f"\n{re.split(r'[><=[]', requirement)[0].lower()}==" in tested.lower(), requirement
 
 
-def test_what_worker_processes_import_is_light(tmp_path: Path) -> None:
-    code = (
-        "import sys, hudepth.data.prepare, hudepth.data.sources.rooms, hudepth.data.sources.densedepth; "
-        "print({'torch', 'lightning', 'hydra', 'matplotlib'} & set(sys.modules))"
-    )
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        ("import hudepth.data.prepare, hudepth.data.sources.rooms, hudepth.data.sources.densedepth", "torch"),
+        ("import hudepth; hudepth.load('nyu')", "torchmetrics"),
+    ],
+    ids=["worker", "predict"],
+)
+def test_processes_import_only_what_they_need(code: str, heavy: str, tmp_path: Path) -> None:
+    code += f"; import sys; print({{'{heavy}', 'lightning', 'hydra', 'matplotlib'}} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, text=True, capture_output=True, check=True)
     assert done.stdout.strip() == "set()"

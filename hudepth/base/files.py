@@ -9,7 +9,8 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,18 @@ def read_yaml(path: Path) -> Any:
         return yaml.load(text, Loader=loader)
     except (ValueError, RecursionError, OverflowError) as error:  # a date of month 13, a number of 10,000 digits
         raise yaml.YAMLError(str(error)) from error
+
+
+def name_results(files: Sequence[Path], root: Path) -> dict[Path, Path]:
+    """Return for each file below ``root`` the relative path, without an ending, of what is made from it.
+
+    Of two that differ only in the ending, it becomes part of the name: ``a_jpg`` and ``a_png``.
+    """
+    stems = {file: file.relative_to(root).with_suffix("") for file in files}
+    times = Counter(stems.values())
+    return {
+        file: stem if times[stem] == 1 else stem.with_name(file.name.replace(".", "_")) for file, stem in stems.items()
+    }
 
 
 def remove_leftovers(folder: Path) -> None:

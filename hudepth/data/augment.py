@@ -123,7 +123,7 @@ class Augmentation:
         image, unit_depth = cut_border(image, unit_depth, self.border)
         if self._moves:
             geometry = self._draw_geometry(draw)
-            image, unit_depth = warp(image, unit_depth, geometry, size=size, aspect=aspect)
+            image, unit_depth = warp(image, unit_depth, geometry, size=size, aspect=aspect, least_zoom=self.zoom[0])
             if not self.zoom_depth:
                 unit_depth = unit_depth * geometry.zoom[:, None, None, None]
         else:

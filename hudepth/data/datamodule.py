@@ -16,12 +16,12 @@ from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from hudepth.base.console import log
-from hudepth.base.errors import ConfigError, DataError
+from hudepth.base.errors import DataError
 from hudepth.base.images import MAX_NATIVE_PIXELS
 from hudepth.base.options import Choice, Range, TrainSize, convert
 from hudepth.base.types import Batch, RawBatch
 from hudepth.data.augment import Augmentation
-from hudepth.data.dataset import DeviceDataset, LateLoader, StoreDataset, as_is, on_device, stored_pairs
+from hudepth.data.dataset import DeviceDataset, LateLoader, StoreDataset, as_is, check_together, on_device, stored_pairs
 from hudepth.data.order import ShardSampler, epoch_seed
 from hudepth.data.prepare import OnError, prepare, share_beyond
 from hudepth.data.preprocess import TrainingBatches, preprocess
@@ -111,6 +111,10 @@ class DepthDataModule(LightningDataModule):
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
         self.cache: Path = convert("data.cache", cache, Path)
+        check_together(
+            source, stream=self.stream, teacher=self.teacher_folder, pictures=self.pictures_folder,
+            on_device=self.on_device, shuffle_block=self.shuffle_block,
+        )  # fmt: skip
         if self.on_error == "skip":
             source.unpaired = []
         self._draws: tuple[int, torch.Generator] | None = None
@@ -133,8 +137,6 @@ class DepthDataModule(LightningDataModule):
         """What is trained on: generated pairs, or stored ones with what a teacher adds, prepared if necessary."""
         if self.stream is None:
             return stored_pairs(self.store, self.split, teacher=self.teacher_folder, pictures=self.pictures_folder)
-        if self.teacher_folder is not None:
-            raise ConfigError("data.stream: a teacher has no depths of new pairs. Pass data.stream=null.")
         return StreamDataset(self.source, size=self.size, count=self.stream)
 
     def prepare_data(self) -> None:

@@ -17,6 +17,7 @@ from hudepth.base.types import RawBatch
 from hudepth.data.distill.pictures import Pictures
 from hudepth.data.distill.teacher import TeacherDepths
 from hudepth.data.order import BlockShuffle
+from hudepth.data.sources.base import Source
 from hudepth.data.splits import Split
 from hudepth.data.store import DepthStore
 
@@ -47,10 +48,9 @@ class StoreDataset(Dataset[RawBatch]):
     def __getitems__(self, positions: Sequence[int]) -> RawBatch:
         """Return the batch at these positions of the subset."""
         rows = [self.indices[position] for position in positions]
-        image, stored_depth = self.store.read(rows)
-        batch = RawBatch(
-            image=torch.from_numpy(image), stored_depth=torch.from_numpy(stored_depth), index=torch.tensor(rows)
-        )
+        image, stored_depth = map(torch.from_numpy, self.store.read(rows))
+        index = torch.tensor(rows, dtype=torch.int64)  # also if there are none, which would make it float
+        batch = RawBatch(image=image, stored_depth=stored_depth, index=index)
         batch["per_m"] = self.store.per_m
         if self.native:
             batch["native_depth"] = [torch.from_numpy(self.store.read_native(row))[None] for row in rows]
@@ -107,12 +107,6 @@ class PicturedDataset(StoreDataset):
         beyond = index - len(self.store)
         return super().pair_id(index) if beyond < 0 else self.pictures.ids[beyond]
 
-    def order(self, *, block: int | None, seed: int, rank: int, world_size: int) -> Sampler[int]:
-        """Return the shuffled positions of an epoch; ConfigError if they are to be in blocks."""
-        if block is not None:
-            raise ConfigError("data.shuffle_block: pictures are not in the store. Pass data.shuffle_block=null.")
-        return super().order(block=None, seed=seed, rank=rank, world_size=world_size)
-
 
 class DeviceDataset(StoreDataset):
     """Pairs of another data set that lie in a device's memory as bytes: nothing is copied there while training.
@@ -137,6 +131,30 @@ class DeviceDataset(StoreDataset):
         places = copy_to(torch.tensor(positions), self._rows.device)
         image, depth, rows = (x.index_select(0, places) for x in (self._image, self._depth, self._rows))
         return RawBatch(image=image, stored_depth=depth.view(torch.uint16), index=rows, per_m=self.store.per_m)
+
+
+def check_together(
+    source: Source,
+    *,
+    stream: int | None,
+    teacher: Path | None,
+    pictures: Path | None,
+    on_device: str,
+    shuffle_block: int | None,
+) -> None:
+    """Raise ConfigError for options of a data module that exclude each other."""
+    clashes = {
+        f"data.stream: {source.name} has only the pairs of its files. Pass data.stream=null.":
+            stream and source.pairs_per_scene is None,
+        "data.stream: a teacher has no depths of new pairs. Pass data.stream=null.": stream and teacher,
+        "data.on_device: generated pairs and those with a teacher are not kept there. Pass data.on_device=auto.":
+            on_device == "true" and (stream or teacher),
+        "distill.pictures: they have no depth without a teacher. Pass distill.teacher=<folder>.":
+            pictures and teacher is None,
+        "data.shuffle_block: pictures are not in the store. Pass data.shuffle_block=null.": pictures and shuffle_block,
+    }  # fmt: skip
+    if found := next((text for text, clash in clashes.items() if clash), None):
+        raise ConfigError(found)
 
 
 def stored_pairs(store: DepthStore, split: Split, *, teacher: Path | None, pictures: Path | None) -> StoreDataset:

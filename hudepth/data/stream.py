@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from hudepth.base.errors import ConfigError
 from hudepth.base.types import RawBatch
 from hudepth.data.order import NewEachEpoch
 from hudepth.data.pairs import prepare_pair, values_per_metre
@@ -22,7 +21,7 @@ class StreamDataset(Dataset[RawBatch]):
     """``count`` generated pairs per epoch, which follow from their number alone (:meth:`Source.generated`).
 
     A position is the number of a pair over all epochs, as :meth:`order` yields it, so that worker processes need not
-    know the epoch. Raises ConfigError if the source does not generate its data.
+    know the epoch.
 
     Args:
         source: what generates the pairs.
@@ -31,8 +30,6 @@ class StreamDataset(Dataset[RawBatch]):
     """
 
     def __init__(self, source: Source, *, size: tuple[int, int], count: int) -> None:
-        if source.pairs_per_scene is None:
-            raise ConfigError(f"data.stream: {source.name} has only the pairs of its files. Pass data.stream=null.")
         self.source, self.size, self.count = source, size, count
 
     def __len__(self) -> int:

@@ -46,6 +46,9 @@ def refuse_training_pairs(checkpoint: Checkpoint, datamodule: DepthDataModule, *
             if past.get("source") == datamodule.source.name:
                 unknown = "so whether it has seen pairs of this one cannot be checked"
                 log.warning("'%s' was trained on another version of %s, %s", checkpoint.path, past["source"], unknown)
+            if past.get("pictures"):
+                unknown = "which were not compared with this data"
+                log.warning("'%s' also learned from %s pictures, %s", checkpoint.path, past["pictures"], unknown)
             continue
         trained = (read_split(checkpoint, datamodule) if number == 0 else None) or _remake_split(past, datamodule)
         for subset in subsets:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import nn
 from hudepth.base.console import log, shows_progress
 from hudepth.base.devices import ProgressBar, build_trainer, check_shares, without_known_warnings
 from hudepth.base.errors import ConfigError
-from hudepth.base.files import output_folder
+from hudepth.base.files import output_folder, written_whole
 from hudepth.base.instantiate import import_trusted
 from hudepth.base.machine import float32_products
 from hudepth.base.options import Range
@@ -142,8 +143,12 @@ def _score(
         _tell_change(name, metrics)
     if options.panels:
         panels = draw(evenly_spaced(evaluation.indices, options.panels))
-        for name in results:
-            save_panels(output / name / "panels.png", panels)
+        paths = [output / name / "panels.png" for name in results]
+        for path in paths[:1]:
+            save_panels(path, panels)
+        for path in paths[1:]:
+            with written_whole(path) as part:
+                shutil.copyfile(paths[0], part)
     if failed:
         raise failed[0]
     log.info("tables and pictures: %s", output.resolve())

@@ -5,11 +5,11 @@ from __future__ import annotations
 import glob
 import itertools
 import re
-from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
 from hudepth.base.errors import DataError
+from hudepth.base.files import name_results
 from hudepth.base.images import SUFFIXES
 
 VIDEO_SUFFIXES = (
@@ -74,11 +74,7 @@ def find_inputs(spec: str, *, recursive: bool, output: Path | None = None) -> In
     if not images and not videos:
         below = "" if recursive else " Pass recursive=true to search subfolders."
         raise DataError(f"input: no image or video in '{spec}' ({', '.join(SUFFIXES + VIDEO_SUFFIXES)}).{below}")
-    stems = {file: file.relative_to(root).with_suffix("") for file in images + videos}
-    times = Counter(stems.values())
-    for file, stem in stems.items():
-        if times[stem] > 1:  # two that differ only in the ending, which becomes part of the name
-            stems[file] = stem.with_name(file.name.replace(".", "_"))
+    stems = name_results(images + videos, root)
     photos, films = ([Item(file, stems[file]) for file in found] for found in (images, videos))
     return Inputs(photos, films, left_out=tuple(left_out))
 

@@ -70,12 +70,16 @@ class AuxiliaryHeads(nn.Module):
         return self
 
     def forward(self, unit_depth: DepthMap, valid: Mask) -> LossTerms:
-        """Return the losses of the last pass of the network in training, for its ground truth."""
+        """Return the losses of the last pass of the network in training, for its ground truth.
+
+        Depth that was clipped to 1 has lost its shape and does not count.
+        """
         seen, self._map = self._map, None
         assert seen is not None
         with torch.autocast(seen.device.type, enabled=False):
             seen = full_precision(seen)
             size = seen.shape[-2:]
+            valid = valid & (unit_depth < 1)
             depth = torch.where(valid, full_precision(unit_depth), 0.0)
             known = functional.interpolate(valid.to(depth), size, mode="area") > 0.999
             depth = torch.where(known, functional.interpolate(depth, size, mode="area"), 1.0)

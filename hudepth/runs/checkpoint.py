@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
-from hudepth.base.errors import CheckpointError, TrainingError, did_you_mean, first_line
-from hudepth.base.files import written_whole
+from hudepth.base.errors import CheckpointError, did_you_mean, first_line
 from hudepth.models.build import build_network
 from hudepth.runs import bundles, hub
-from hudepth.runs.run import LAST, best_checkpoint, find_run, is_run, newest_run
+from hudepth.runs.run import best_checkpoint, find_run, is_run, newest_run
 from hudepth.runs.sections import check_config
 
 KEY = "hudepth"
@@ -26,24 +23,6 @@ KEY = "hudepth"
 VERSION = 2
 """1: before the encoder and the head were renamed."""
 NET_PREFIX = "net."
-
-
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes to a temporary file, then renames it: a full disk or a kill never costs the previous checkpoint."""
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write a checkpoint. Raises TrainingError if that is not possible; the previous one is intact."""
-        folder, why = Path(path).parent, "the disk is full, or a file may not be so large"
-        try:
-            with written_whole(Path(path)) as part:
-                torch.save(checkpoint, part)
-        except (OSError, RuntimeError) as error:
-            if not re.search(r"unexpected pos|iostream|file write failed", str(error)):  # torch's for a full disk
-                why = getattr(error, "strerror", None) or first_line(error)
-            last = f"The previous one is intact: free some space, then resume with hudepth-train resume={folder.parent}"
-            if not (folder / LAST).is_file():
-                last = "It is the first one: free some space, then train again."
-            raise TrainingError(f"the checkpoint '{path}' could not be saved ({why}). {last}") from error
 
 
 @dataclass(frozen=True)
@@ -86,17 +65,17 @@ class Checkpoint:
     def fill(self, net: nn.Module, *, skip: Sequence[str] = ()) -> None:
         """Load the tensors into a network, but not into the parts named in ``skip``, whatever shapes these have.
 
-        Raises CheckpointError if they do not fit, or the network has no such part.
+        Raises CheckpointError if they do not fit, or neither network nor checkpoint has such a part.
         """
         own = net.state_dict()
         for part in skip:
-            if not any(_is_of(name, [part]) for name in own):
-                parts = ", ".join(name for name, _ in net.named_children())
+            if not any(_is_of(name, [part]) for name in {**own, **self.state}):
+                parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in own))
                 raise CheckpointError(f"init_skip: {type(net).__name__} has no part '{part}'. It has {parts}.")
-        kept = {name: tensor for name, tensor in own.items() if _is_of(name, skip)}
-        given = {name: tensor for name, tensor in self.state.items() if not _is_of(name, skip)}
-        self._check_fits(own, {**kept, **given})
-        net.load_state_dict({**kept, **given})
+        state = {name: tensor for name, tensor in self.state.items() if not _is_of(name, skip)}
+        state |= {name: tensor for name, tensor in own.items() if _is_of(name, skip)}
+        self._check_fits(own, state)
+        net.load_state_dict(state)
 
     def _check_fits(self, own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
         names = {**own, **given}

@@ -1,14 +1,37 @@
-"""Which weights are kept, and when training stops early: judged at full image size only."""
+"""Which weights are kept, how they are written, and when training stops early: judged at full image size only."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 
+from hudepth.base.errors import TrainingError, first_line
+from hudepth.base.files import written_whole
 from hudepth.runs.run import BEST, CHECKPOINTS, LAST
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes to a temporary file, then renames it: a full disk or a kill never costs the previous checkpoint."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write a checkpoint. Raises TrainingError if that is not possible; the previous one is intact."""
+        folder, why = Path(path).parent, "the disk is full, or a file may not be so large"
+        try:
+            with written_whole(Path(path)) as part:
+                torch.save(checkpoint, part)
+        except (OSError, RuntimeError) as error:
+            if not re.search(r"unexpected pos|iostream|file write failed", str(error)):  # torch's for a full disk
+                why = getattr(error, "strerror", None) or first_line(error)
+            last = f"The previous one is intact: free some space, then resume with hudepth-train resume={folder.parent}"
+            if not (folder / LAST).is_file():
+                last = "It is the first one: free some space, then train again."
+            raise TrainingError(f"the checkpoint '{path}' could not be saved ({why}). {last}") from error
 
 
 def at_full_size(trainer: Trainer) -> bool:

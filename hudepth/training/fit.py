@@ -20,6 +20,7 @@ from hudepth.base.machine import float32_products, keep_freed_memory, resolve_pr
 from hudepth.base.options import parse
 from hudepth.data.build import build_data
 from hudepth.data.datamodule import DepthDataModule
+from hudepth.data.dataset import PicturedDataset
 from hudepth.data.splits import load_split, save_split
 from hudepth.evaluation.lineage import BEFORE
 from hudepth.evaluation.protocols import build_protocols
@@ -153,6 +154,8 @@ def build_module(
 
     info = datamodule.store.info
     data = {key: info[key] for key in ("source", "fingerprint", "encoding", "pairs", "native_sizes")}
+    if isinstance(pairs := datamodule.training_pairs, PicturedDataset):
+        data["pictures"] = len(pairs.pictures)
     if datamodule.source.camera is not None:
         choice = CameraChoice.of(datamodule.source.camera, key="data.source.camera")
         data["focal"] = list(choice.over_sides(info["native_sizes"], key="data.source.camera"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,7 +45,7 @@ class Training:
 def restore_parents(training: Training, net: nn.Module, data: DepthDataModule) -> Parents:
     """Return what the initial weights were trained on; load these weights if the run is new."""
     if training.overrides is None:
-        return start_from(net, training.config, data) if training.options.init else []
+        return start_from(net, training, data) if training.options.init else []
     if epochs := sorted({look["epoch"] for look in run_dir.read_scored(training.path)}):
         log.warning(
             "this run was tested after epoch %s. If that is why it is resumed, its next test is too good; metrics.json "
@@ -84,15 +83,15 @@ def network_before(training: Training, *, size: tuple[int, int], max_depth_m: fl
     return net if before_m == max_depth_m else Rescaled(net, before_m / max_depth_m)
 
 
-def start_from(net: nn.Module, config: Mapping[str, Any], datamodule: DepthDataModule) -> Parents:
-    """Load the weights of ``config["init"]`` into a network; return what they were trained on.
+def start_from(net: nn.Module, training: Training, datamodule: DepthDataModule) -> Parents:
+    """Load the weights of ``init`` into a network; return what they were trained on.
 
-    The parts in ``config["init_skip"]`` stay as they are. Raises CheckpointError if there is no such checkpoint or it
+    The parts in ``init_skip`` stay as they are. Raises CheckpointError if there is no such checkpoint or it
     belongs to another network, DataError if it was trained on pairs that this training validates or tests on.
     """
-    checkpoint = load_checkpoint(str(config["init"]), runs=config["paths"]["runs"], key="init")
+    checkpoint = load_checkpoint(str(training.options.init), runs=training.config["paths"]["runs"], key="init")
     refuse_training_pairs(checkpoint, datamodule, subsets=("val", "test"))
-    skip = list(config.get("init_skip") or ())
+    skip = training.options.init_skip or ()
     checkpoint.fill(net, skip=skip)
     but = f", but {' and '.join(skip)}" if skip else ""
     log.info("init: weights of '%s', epoch %d%s", checkpoint.path, checkpoint.epoch, but)

@@ -32,8 +32,13 @@ def check_parts(config: Mapping[str, Any], options: TrainOptions) -> None:
     """
     trust = options.trust
     import_trusted(trust)
-    build_data(config["data"], trust=trust, augment=config.get("augment"))
+    data = build_data(config["data"], trust=trust, augment=config.get("augment"))
     auxiliary = build_auxiliary(config, trust=trust)
+    if auxiliary and data.source.sparse:
+        raise ConfigError(
+            f"auxiliary: {data.source.name} measures few pixels, and normals and edges need neighbours. "
+            "Pass auxiliary=none."
+        )
     if not trust:  # else it may be of any kind
         with torch.device("meta"):
             net = build_network({**config["model"], **({"weights": None} if "weights" in config["model"] else {})})

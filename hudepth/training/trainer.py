@@ -21,9 +21,8 @@ from hudepth.base.instantiate import instantiate
 from hudepth.data.datamodule import DepthDataModule
 from hudepth.evaluation.pictures import evenly_spaced
 from hudepth.runs import history
-from hudepth.runs.checkpoint import AtomicCheckpointIO
 from hudepth.training.callbacks import CompileTime, EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
-from hudepth.training.checkpointing import FullSizeEarlyStopping, checkpoint_callbacks
+from hudepth.training.checkpointing import AtomicCheckpointIO, FullSizeEarlyStopping, checkpoint_callbacks
 from hudepth.training.loggers.steps import LogSteps
 from hudepth.training.study import TRIAL_ENV, TrialPruner
 from hudepth.training.times import Times

@@ -73,7 +73,7 @@ def test_every_experiment_changes_something_and_runs_a_step(
     steps = ["trainer.limit_train_batches=1", "trainer.limit_val_batches=1"]
     weights = ["model.weights=none"] if choice.startswith("experiment=") else []
     size = ["data.size=[64,64]"] if choice == "experiment=lite" else []
-    sys_argv = ["hudepth-train", choice, *SMALL, *size, *steps, *weights]
+    sys_argv = ["hudepth-train", choice, *SMALL, *size, *steps, *weights, "test=false"]
     monkeypatch.setattr(sys, "argv", sys_argv)
     assert cli.train() == 0
     assert list(tmp_path.glob("runs/*/*/status.json"))

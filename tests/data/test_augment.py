@@ -262,10 +262,20 @@ def test_a_fine_checkerboard_turns_grey(through: str) -> None:
     assert small.mean().item() == pytest.approx(0.5, abs=1e-6)
 
 
+def test_a_shrunk_image_skips_no_pixels() -> None:
+    board = (torch.arange(40)[:, None] + torch.arange(40)) % 2
+    image, depth = board.float().expand(1, 3, 40, 40), torch.ones(1, 1, 40, 40)
+    small, _ = Augmentation(zoom=(0.5, 0.5))(
+        image, depth, size=(20, 20), aspect=1.0, generator=torch.Generator().manual_seed(0)
+    )
+    torch.testing.assert_close(small, torch.full_like(small, 0.5))
+
+
 def test_only_what_is_more_than_twice_as_large_is_shrunk_first() -> None:
     image, _ = pair(size=(12, 24))
-    assert _at_most_twice(image, (6, 12)) is image
-    shrunk = _at_most_twice(image, (6, 4))
+    assert _at_most_twice(image, (6, 12), zoom=1.0) is image
+    assert _at_most_twice(image, (6, 12), zoom=0.5).shape[-2:] == (6, 12)
+    shrunk = _at_most_twice(image, (6, 4), zoom=1.0)
     np.testing.assert_allclose(shrunk, image.reshape(2, 3, 12, 8, 3).mean(dim=4), rtol=1e-5)
 
 

@@ -94,9 +94,9 @@ def test_nothing_of_the_stream_is_stored(tmp_path: Path) -> None:
 def test_files_cannot_be_streamed(tmp_path: Path) -> None:
     (tmp_path / "image").mkdir()
     with pytest.raises(ConfigError, match=r"^data\.stream: folder has only the pairs of its files"):
-        StreamDataset(FolderSource(tmp_path), size=SIZE, count=4)
+        DepthDataModule(FolderSource(tmp_path), size=SIZE, stream=4)
 
 
 def test_a_teacher_has_no_depths_of_new_pairs(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"^data\.stream: a teacher"):
-        stream_data(tmp_path, teacher=tmp_path).train_dataloader()
+        stream_data(tmp_path, teacher=tmp_path)

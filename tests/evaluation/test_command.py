@@ -206,6 +206,15 @@ def test_pairs_that_chose_the_best_epoch_are_not_tested_on(trained: Path) -> Non
     refuse_training_pairs(checkpoint, datamodule, subsets=("val",))
 
 
+def test_pictures_are_told_of_where_they_were_not_compared(trained: Path, caplog: pytest.LogCaptureFixture) -> None:
+    checkpoint = load_checkpoint(str(trained))
+    datamodule, _ = open_data(checkpoint, {}, trust=[])
+    for fingerprint, told in ((checkpoint.data["fingerprint"], False), ("another", True)):
+        past = {**checkpoint.data, "fingerprint": fingerprint, "source": "folder", "pictures": 7}
+        refuse_training_pairs(replace(checkpoint, data=past), datamodule, subsets=("test",))
+        assert ("also learned from 7 pictures, which were not compared with this data" in caplog.text) is told
+
+
 def test_an_output_in_the_way_is_found_before_the_work(command: Command, trained: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     done = command("test", f"checkpoint={trained}", "output=taken")

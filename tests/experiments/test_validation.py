@@ -29,6 +29,12 @@ def test_checkpoints_are_compared_on_the_validation_pairs(command: Command, tmp_
     assert float(change.split()[0]) == pytest.approx(means[1] - means[0], abs=2e-3)
     assert "nan to" in change.replace("+", "")  # of three scenes there are no intervals
     assert lines[-1] == "6 validation images of 3 scenes, paper protocol."
+    assert command("train", *shared, "name=d", "data.size=[32,64]").code == 0
+    larger = {"a": checkpoints["a"], "d": load_checkpoint(str(next((tmp_path / "runs" / "d").iterdir())))}
+    with pytest.raises(ConfigError, match=r"^d: another size, at which this protocol scores, than a\."):
+        compare(larger, protocol="paper")
+    larger["d"].config["protocol"]["paper"]["max_depth_m"] = 0.5  # the first one's counts
+    assert len(compare({"a": checkpoints["a"], "b": checkpoints["b"]}, protocol="paper")) == len(lines)
     with pytest.raises(ConfigError, match=r"^c: another split"):
         compare({name: checkpoints[name] for name in "ac"}, protocol="paper")
     with pytest.raises(ConfigError, match=r"^--protocol kitti: the first checkpoint was trained with paper"):

@@ -100,6 +100,20 @@ def test_what_was_not_measured_does_not_count() -> None:
     assert heads(depth, torch.zeros_like(valid)).total.item() == 0
 
 
+def test_clipped_depth_does_not_count() -> None:
+    """A wall that recedes beyond the maximum depth is no wall that faces the camera."""
+    heads, net = attached(edges=0.0)
+    depth = plane((0.6, 0.0, -0.8), height=16, width=24)
+    depth = (depth / depth[..., 12:13]).clamp(max=1).expand(2, 1, 16, 24)
+    clipped = depth == 1
+    assert clipped.any()
+    assert not clipped.all()
+    with torch.no_grad():
+        heads.heads["normals"].bias.copy_(torch.tensor([0.6, 0.0, -0.8]))
+    net(torch.zeros(()))
+    assert heads(depth, torch.ones_like(clipped)).total.item() == pytest.approx(0, abs=1e-3)
+
+
 def test_a_weight_of_0_leaves_a_head_out() -> None:
     heads, net = attached(edges=0.0)
     assert list(heads.heads) == ["normals"]

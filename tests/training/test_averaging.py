@@ -24,11 +24,11 @@ from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.losses import BADCL
 from hudepth.models import TinyUNet
-from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
+from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.history import read_history
 from hudepth.training.averaging import EMA, averaged_state
 from hudepth.training.callbacks import History, LogLosses
-from hudepth.training.checkpointing import checkpoint_callbacks
+from hudepth.training.checkpointing import AtomicCheckpointIO, checkpoint_callbacks
 from hudepth.training.module import DepthModule
 
 

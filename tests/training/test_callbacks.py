@@ -29,11 +29,11 @@ from hudepth.data.sources.rooms import RoomsSource
 from hudepth.evaluation.pictures import evenly_spaced, make_panels
 from hudepth.losses import BADCL
 from hudepth.models import TinyUNet
-from hudepth.runs.checkpoint import AtomicCheckpointIO, read_plain
+from hudepth.runs.checkpoint import read_plain
 from hudepth.runs.history import read_history
 from hudepth.training import callbacks
 from hudepth.training.callbacks import EpochLine, EpochSeed, History, Interrupt, LogLosses, PanelPictures
-from hudepth.training.checkpointing import checkpoint_callbacks
+from hudepth.training.checkpointing import AtomicCheckpointIO, checkpoint_callbacks
 from hudepth.training.module import DepthModule
 from hudepth.viz.panels import Panel
 

@@ -237,6 +237,8 @@ def test_parts_that_init_skips_begin_anew_whatever_their_shapes(command: Command
         done = command("train", *QUIET, *wide, f"init_skip={skip}")
         assert done.code == 1
         assert line in last_line(done.err)
+    done = command("train", *QUIET, *wide, "name=text", "init_skip=decode", "model.channels=3")
+    assert "tensors do not fit" in last_line(done.err)  # of the other parts: one name needs no brackets
 
 
 @pytest.mark.parametrize(("changes", "worse"), [(["optim.lr=3"], True), (["data.max_depth_m=20"], None)])
@@ -427,6 +429,12 @@ def test_auxiliary_heads_train_and_resume_and_are_no_part_of_the_network(command
         assert "val/loss/normals" not in row
     net = load_checkpoint(str(whole)).build_net(trust=[])
     assert not [name for name, _ in net.named_parameters() if "heads" in name]
+
+
+def test_auxiliary_heads_need_dense_depth(command: Command) -> None:
+    done = command("train", "model=lite", "model.weights=none", "data=kitti", "data.root=.", "auxiliary=heads")
+    assert done.code == 1
+    assert last_line(done.err).startswith("hudepth-train: auxiliary: kitti measures few pixels")
 
 
 def test_auxiliary_heads_need_a_decoder(command: Command) -> None:

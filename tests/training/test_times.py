@@ -17,8 +17,7 @@ from hudepth.data.datamodule import DepthDataModule
 from hudepth.data.sources.rooms import RoomsSource
 from hudepth.losses import BADCL
 from hudepth.models import TinyUNet
-from hudepth.runs.checkpoint import AtomicCheckpointIO
-from hudepth.training.checkpointing import checkpoint_callbacks
+from hudepth.training.checkpointing import AtomicCheckpointIO, checkpoint_callbacks
 from hudepth.training.module import DepthModule
 from hudepth.training.optim import GroupedAdamW
 from hudepth.training.times import COLUMNS, Times, read_times

@@ -12,21 +12,20 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hudepth.base.console import track
+from hudepth.base.console import log, track
 from hudepth.base.errors import DataError
-from hudepth.base.files import written_whole
+from hudepth.base.files import name_results, written_whole
 from hudepth.base.images import resize_image
 from hudepth.data.audit.duplicates import NEAR_BITS, find_nearest_hashes, hash_images
 from hudepth.data.distill.teacher import find_depths, read_teacher
 from hudepth.data.prepare import build_once
 from hudepth.data.sources.contents import hash_contents
 from hudepth.data.sources.decoding import read_image
-from hudepth.data.sources.files import PerProcess
+from hudepth.data.sources.files import IMAGE_SUFFIXES, PerProcess
 from hudepth.data.sources.hdf5 import RowFile
 from hudepth.data.splits import Split
 from hudepth.data.store import DepthStore
 
-SUFFIXES = (".jpg", ".jpeg", ".png")
 _AT_ONCE = 64
 
 
@@ -34,13 +33,14 @@ class Pictures:
     """Pictures of a folder and its subfolders, each with a teacher's depth, prepared once at the training size.
 
     Args:
-        folder: JPEG and PNG files. A picture's id is its path in the folder without the suffix.
+        folder: JPEG and PNG files. A picture's id is the name that ``hudepth-predict`` gives its results, which is its
+            path in the folder without the suffix, unless two differ in that alone.
         teacher: folder of a depth for each id, as for :class:`hudepth.data.distill.teacher.TeacherDepths`.
         store: the depth store of the training pairs.
         split: of the store. The images of its validation and test pairs may not be among the pictures.
 
-    Raises DataError if there are none, one cannot be read, one has no depth of its size, or one is a duplicate of an
-    image that is held out, exact or near, by perceptual hash.
+    Raises DataError if there are none, one cannot be read, one has the id of a training pair or no depth of its size,
+    or one is a duplicate of an image that is held out, exact or near, by perceptual hash.
     """
 
     def __init__(self, folder: str | Path, teacher: str | Path, store: DepthStore, split: Split) -> None:
@@ -49,12 +49,17 @@ class Pictures:
             raise DataError(
                 f"distill.pictures: no folder '{root}'. Pass distill.pictures=<folder of JPEG or PNG files>."
             )
-        files = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
-        if not files:
-            raise DataError(f"distill.pictures: no JPEG or PNG file in '{root}'.")
-        self.ids = [file.relative_to(root).with_suffix("").as_posix() for file in files]
+        taught = Path(teacher).expanduser()
+        files = _find_pictures(root, taught)
+        self.ids = [stem.as_posix() for stem in name_results(files, root).values()]
+        if both := sorted({*self.ids} & {store.records[index].id for index in split.train}):
+            raise DataError(
+                f"distill.pictures: {len(both)} pictures have the name of a training pair, the first is '{both[0]}', "
+                f"so both would have one depth in '{taught}'. Move the pictures into a subfolder of '{root}', and "
+                "predict them with recursive=true."
+            )
         self.size = store.size
-        depths = find_depths(Path(teacher).expanduser(), self.ids, what="pictures")
+        depths = find_depths(taught, self.ids, what="pictures")
         cache = store.path.parent
         key = [hash_contents("pictures", [*files, *depths], cache=cache), self.size]
         self.path = cache / f"pictures-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.h5"
@@ -89,6 +94,18 @@ class Pictures:
                 f"distill.pictures: {copies.size} of {len(self)} pictures show images that are held out, the first is "
                 f"'{files[first]}', like '{store.records[theirs[nearest[first]]].id}'. Leave them out."
             )
+
+
+def _find_pictures(root: Path, teacher: Path) -> list[Path]:
+    """Return the JPEG and PNG files of a folder, but no hidden ones and none of the teacher's; count the others."""
+    there = [path for path in sorted(root.rglob("[!.]*")) if path.is_file() and teacher not in path.parents]
+    others = [path.name for path in there if path.suffix.lower() not in IMAGE_SUFFIXES]
+    files = [path for path in there if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not files:
+        raise DataError(f"distill.pictures: no JPEG or PNG file in '{root}'.")
+    if others:
+        log.info("distill.pictures: left out, neither JPEG nor PNG: %d (%s)", len(others), ", ".join(others[:5]))
+    return files
 
 
 def _prepare(files: Sequence[Path], depths: Sequence[Path], size: tuple[int, int], path: Path) -> None:

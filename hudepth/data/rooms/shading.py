@@ -195,7 +195,7 @@ def _expose(linear: F32, view: View, rng: np.random.Generator, look: Look) -> ND
     linear[:, :, 1:-1] = 0.5 * linear[:, :, 1:-1] + 0.25 * (linear[:, :, :-2] + linear[:, :, 2:])
     gain = 0.15 * rng.uniform(*look.exposure) / float(np.minimum(linear[1], 3.0).mean())
     balance = gain * np.array([rng.uniform(*look.red), 1, rng.uniform(*look.blue)])
-    vignette = 1 - np.float32(rng.uniform(0.1, 0.35)) * np.add.outer(view.ys**2, view.xs**2)
+    vignette = 1 - np.float32(rng.uniform(0.1, 0.35)) * np.minimum(np.add.outer(view.ys**2, view.xs**2), 2)
     linear *= vignette * balance.astype(np.float32)[:, None, None]
     step = np.minimum(linear * np.float32(2048), np.float32(4095)).astype(np.int16)
     image: F32 = _tone_curve()[step.transpose(1, 2, 0)]

@@ -36,20 +36,21 @@ def warp(
     *,
     size: tuple[int, int],
     aspect: float,
+    least_zoom: float = 1.0,
 ) -> tuple[Float[Tensor, "b 3 h2 w2"], Float[Tensor, "b d h2 w2"]]:
     """Crop, zoom, roll and flip images and depths (0 where unmeasured) in any units, and resize them to ``size``.
 
     Images are interpolated linearly; depth takes the nearest pixel, since the mean of two surfaces is the depth of
     neither. Beyond the image's edge, colours are repeated and depth is unmeasured. Zooming divides depth; rolling and
     moving the crop do not change depth along the optical axis. ``aspect`` is width over height of the scene, so that a
-    roll is a rotation even if images were stretched to another shape.
+    roll is a rotation even if images were stretched to another shape. No zoom is below ``least_zoom``.
     """
     cos, sin = geometry.angle.cos() / geometry.zoom, geometry.angle.sin() / geometry.zoom
     mirror = torch.where(geometry.flip, -1.0, 1.0).to(cos)
     along_x = torch.stack([cos * mirror, sin * aspect * mirror], dim=1)
     along_y = torch.stack([-sin / aspect, cos], dim=1)
     grid = _affine_grid(along_x, along_y, geometry.centre, size)
-    image = _at_most_twice(image, size)
+    image = _at_most_twice(image, size, zoom=min(least_zoom, 1.0))
     image = functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
     depth = functional.grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)
     return image, depth / geometry.zoom[:, None, None, None]
@@ -84,7 +85,7 @@ def resize(
     return functional.interpolate(image, size, mode="area"), functional.interpolate(depth, size, mode="nearest-exact")
 
 
-def _at_most_twice(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Shrink images more than twice as large as ``size``: linear interpolation would skip pixels."""
-    target = [min(have, 2 * want) for have, want in zip(image.shape[-2:], size, strict=True)]
+def _at_most_twice(image: Tensor, size: tuple[int, int], *, zoom: float) -> Tensor:
+    """Shrink images more than twice as large as ``size`` times ``zoom``: linear interpolation would skip pixels."""
+    target = [min(have, math.ceil(2 * want * zoom)) for have, want in zip(image.shape[-2:], size, strict=True)]
     return image if target == list(image.shape[-2:]) else functional.interpolate(image, target, mode="area")

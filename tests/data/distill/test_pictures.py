@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,59 @@ def test_an_empty_folder_and_none_at_all(source: RoomsSource, cache: Path, folde
             make(source, cache, {**folders, "pictures": folder}).prepare_data()
 
 
-def test_blocks_hold_no_pictures(source: RoomsSource, cache: Path, folders: dict[str, Path]) -> None:
-    with pytest.raises(ConfigError, match=r"^data\.shuffle_block"):
-        make(source, cache, folders, shuffle_block=2).train_dataloader()
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"shuffle_block": 2}, "data.shuffle_block"), ({"on_device": True}, "data.on_device"),
+        ({"stream": 4}, "data.stream: a teacher"), ({"teacher": None}, "distill.pictures: they have no depth"),
+    ],
+)  # fmt: skip
+def test_options_that_pictures_exclude(
+    source: RoomsSource, cache: Path, folders: dict[str, Path], options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}"):
+        make(source, cache, {**folders, **options})
+
+
+def test_a_picture_may_not_share_the_depth_of_a_pair(
+    source: RoomsSource, cache: Path, folders: dict[str, Path]
+) -> None:
+    data = make(source, cache, folders)
+    record = source.records()[data.split.train[0]]
+    file = folders["pictures"] / f"{record.id}.png"
+    file.parent.mkdir()
+    cv2.imwrite(str(file), picture(9))
+    with pytest.raises(DataError, match=rf"^distill\.pictures: 1 pictures have the name .* the first is '{record.id}'"):
+        data.prepare_data()
+
+
+def test_pictures_are_named_and_left_out_as_hudepth_predict_does(
+    source: RoomsSource, cache: Path, folders: dict[str, Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two that differ in the ending have two depths; hidden files, other kinds and the teacher's own are none."""
+    caplog.set_level("INFO", logger="hudepth")
+    root = folders["pictures"]
+    cv2.imwrite(str(root / "a.jpg"), picture(7))
+    (root / "._b.png").write_bytes(b"of a file system")
+    (root / "notes.txt").write_text("none")
+    inside = root / "taught"
+    folders["teacher"].rename(inside)
+    for name, value in (("a_png", 1.0), ("a_jpg", 8.0)):
+        np.save(inside / f"{name}_depth.npy", np.full(NATIVE, value, np.float32))
+    cv2.imwrite(str(inside / "a_jpg_colour.png"), picture(8))
+    pairs = make(source, cache, {"pictures": root, "teacher": inside}).training_pairs
+    assert isinstance(pairs, PicturedDataset)
+    assert pairs.pictures.ids == ["a_jpg", "a_png", "away/c", "b"]
+    assert pairs.pictures.read([0, 1])[1][:, 0, 0].tolist() == [8.0, 1.0]
+    assert "left out, neither JPEG nor PNG: 1 (notes.txt)" in caplog.text
+
+
+def test_a_batch_of_pictures_alone_is_like_any_other(
+    source: RoomsSource, cache: Path, folders: dict[str, Path]
+) -> None:
+    pairs = make(source, cache, folders).training_pairs
+    alone, mixed = pairs.__getitems__([len(pairs) - 1]), pairs.__getitems__([0, len(pairs) - 1])
+    assert {name: value.dtype for name, value in alone.items() if isinstance(value, torch.Tensor)} == {
+        name: value.dtype for name, value in mixed.items() if isinstance(value, torch.Tensor)
+    }
+    assert pairs.pair_id(alone["index"].tolist()[0]) == "b"

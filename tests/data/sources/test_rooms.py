@@ -14,8 +14,10 @@ import pytest
 
 from hudepth.base.camera.intrinsics import Intrinsics
 from hudepth.base.errors import ConfigError, DataError
+from hudepth.data.rooms.look import STUDIO
 from hudepth.data.rooms.raycast import BOX, CYLINDER, F64, ROOM_FACES, Solids, View, pinhole_view, trace
 from hudepth.data.rooms.scene import build_room
+from hudepth.data.rooms.shading import _expose
 from hudepth.data.sources import rooms
 from hudepth.data.sources.rooms import RoomsSource, kinect_holes
 
@@ -72,6 +74,14 @@ def test_each_room_has_a_camera_of_its_own() -> None:
 def test_an_impossible_field_of_view_is_refused(fov_deg: Any) -> None:
     with pytest.raises(ConfigError, match=r"data\.source\.fov_deg"):
         RoomsSource(fov_deg=fov_deg)
+
+
+def test_a_lens_darkens_corners_and_turns_none_white() -> None:
+    view = pinhole_view(np.zeros(3), np.eye(3), height=48, width=64, zoom=0.3)  # 119 degrees
+    for seed in range(20):
+        image = _expose(np.ones((3, 48, 64), np.float32), view, np.random.default_rng(seed), STUDIO)
+        corners, centre = image[[0, 0, -1, -1], [0, -1, 0, -1]].astype(int), image[24, 32].astype(int)
+        assert (corners <= centre + 25).all()  # noise
 
 
 # Determinism
