@@ -37,6 +37,19 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
 
+LONGEST = ("test_docs.py", "test_typing.py", "test_ddp.py", "sweep/test_kill.py", "training/test_command.py")
+"""Files whose tests should not be the last to begin."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Move the longest files to the beginnings of both halves, where two processes begin."""
+    order = {name: [item for item in items if item.path.as_posix().endswith(name)] for name in LONGEST}
+    first, second = ([item for name in names for item in order[name]] for names in (LONGEST[::2], LONGEST[1::2]))
+    others = [item for item in items if item not in {*first, *second}]
+    middle = len(items) // 2 - len(first)
+    items[:] = [*first, *others[: max(middle, 0)], *second, *others[max(middle, 0) :]]
+
+
 @pytest.fixture(scope="session")
 def nyu_root() -> Path:
     """Folder of the labelled NYU frames."""

@@ -60,9 +60,10 @@ def test_a_sweep_that_is_killed_again_and_again_ends_with_the_same_table(
     launcher: str, undisturbed: Path, tmp_path: Path, cache: Path
 ) -> None:
     rng = random.Random(launcher)
-    for _ in range(KILLS):
+    for number in range(KILLS):
         process = start(tmp_path, cache, *SWEEP, "sweep_dir=s", f"hydra/launcher={launcher}")
-        time.sleep(2 + 8 * rng.random())
+        wait_for(lambda least=2 * number: len(list(tmp_path.glob("s/*/metrics.csv"))) > least)
+        time.sleep(rng.random())
         if rng.random() < 0.5:  # the launcher alone: what it started must end by itself
             process.kill()
         else:
