@@ -90,13 +90,12 @@ class DepthDataModule(LightningDataModule):
         prepare_workers: int | None = None,
     ) -> None:
         super().__init__()
-        split = convert("data.split", split, str)
-        fractions = convert("data.fractions", fractions, list[float])
-        check_split(split, fractions)
+        self.split_kind: str = convert("data.split", split, str)
+        self.fractions = tuple(convert("data.fractions", fractions, list[float]))
+        check_split(self.split_kind, self.fractions)
         self.source, self.augment = source, augment
         self.teacher_folder: Path | None = convert("distill.teacher", teacher, Path | None)
         self.pictures_folder: Path | None = convert("distill.pictures", pictures, Path | None)
-        self.split_kind, self.fractions = split, tuple(fractions)
         self.size: tuple[int, int] = convert("data.size", size, TrainSize)
         self.stages = read_stages(progressive or [], size=self.size)
         self.split_seed: int = convert("data.split_seed", split_seed, int)
@@ -111,12 +110,10 @@ class DepthDataModule(LightningDataModule):
         self.native: bool = convert("data.native", native, bool)
         self.on_error: str = convert("data.on_error", on_error, OnError)
         self.cache: Path = convert("data.cache", cache, Path)
-        check_together(
-            source, stream=self.stream, teacher=self.teacher_folder, pictures=self.pictures_folder,
-            on_device=self.on_device, shuffle_block=self.shuffle_block,
-        )  # fmt: skip
         if self.on_error == "skip":
             source.unpaired = []
+        added = {"stream": self.stream, "teacher": self.teacher_folder, "pictures": self.pictures_folder}
+        check_together(source, **added, on_device=self.on_device, shuffle_block=self.shuffle_block)
         self._draws: tuple[int, torch.Generator] | None = None
         self._training_batches = TrainingBatches(augment, max_depth_m=self.max_depth_m)
 
