@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -61,43 +62,46 @@ def test_the_wheel_brings_a_model(site: Path) -> None:
         assert (site / "hudepth" / "pretrained" / name / "model.safetensors").stat().st_size < 10_000_000
 
 
-def wheel_command(site: Path, task: str, *arguments: str, cwd: Path) -> subprocess.Popen[str]:
-    """Start a console script of the unpacked wheel, which is not that of this repository."""
-    code = f"import sys; from hudepth import cli; assert {str(site)!r} in cli.__file__; sys.exit(cli.{task}())"
+def wheel_commands(site: Path, *commands: Sequence[str], cwd: Path) -> subprocess.Popen[str]:
+    """Start console scripts of the unpacked wheel, which are not those of this repository, one after another."""
+    lines = ["import sys", "from hydra.core.global_hydra import GlobalHydra", "from hudepth import cli"]
+    lines.append(f"assert {str(site)!r} in cli.__file__")
+    for task, *words in commands:
+        lines += ["GlobalHydra.instance().clear()", f"sys.argv[1:] = {words}", f"assert cli.{task}() == 0"]
     environment = {**os.environ, "PYTHONPATH": str(site), "HUDEPTH_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=cwd, env=environment, **pipes)
+    return subprocess.Popen([sys.executable, "-c", "\n".join(lines)], cwd=cwd, env=environment, **pipes)
 
 
-def run_wheel(site: Path, task: str, *arguments: str, cwd: Path) -> str:
-    process = wheel_command(site, task, *arguments, cwd=cwd)
+def run_wheel(site: Path, *commands: Sequence[str], cwd: Path) -> str:
+    process = wheel_commands(site, *commands, cwd=cwd)
     output, _ = process.communicate(timeout=240)
     assert process.returncode == 0, output
     return output
 
 
 def test_the_wheel_composes_from_anywhere(site: Path, tmp_path: Path) -> None:
-    assert "max_epochs: 100" in run_wheel(site, "train", "experiment=badcl", "--cfg", "job", cwd=tmp_path)
+    assert "max_epochs: 100" in run_wheel(site, ("train", "experiment=badcl", "--cfg", "job"), cwd=tmp_path)
 
 
 @pytest.mark.slow
 def test_the_wheel_trains_predicts_and_reports_from_anywhere(site: Path, tmp_path: Path) -> None:
-    run_wheel(site, "train", "experiment=demo", *TINY, cwd=tmp_path)
     Image.new("RGB", (64, 48), (200, 120, 40)).save(tmp_path / "photo.png")
-    for checkpoint in ("nyu", "last"):
-        said = run_wheel(
-            site, "predict", f"checkpoint={checkpoint}", "input=photo.png", f"output={checkpoint}", cwd=tmp_path
-        )
-        assert "1 predicted" in said
-        assert np.load(tmp_path / checkpoint / "photo_depth.npy").shape == (48, 64)
-    run_wheel(site, "report", "figures", "run=last", cwd=tmp_path)
+    predict = ("predict", "input=photo.png")
+    said = run_wheel(
+        site, ("train", "experiment=demo", *TINY), (*predict, "checkpoint=nyu", "output=nyu"),
+        (*predict, "checkpoint=last", "output=last"), ("report", "figures", "run=last"), cwd=tmp_path,
+    )  # fmt: skip
+    assert said.count("1 predicted") == 2
+    for output in ("nyu", "last"):
+        assert np.load(tmp_path / output / "photo_depth.npy").shape == (48, 64)
     assert len(list(tmp_path.glob("runs/demo/*/figures/*.png"))) == 2
 
 
 @pytest.mark.slow
 def test_the_wheel_serves_the_page_from_anywhere(site: Path, tmp_path: Path) -> None:
     pytest.importorskip("gradio", reason="gradio is not installed")
-    process = wheel_command(site, "demo", "port=0", cwd=tmp_path)
+    process = wheel_commands(site, ("demo", "port=0"), cwd=tmp_path)
     assert process.stdout is not None
     try:
         address = next(found[0] for line in process.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+", line)))

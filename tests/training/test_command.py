@@ -285,22 +285,6 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path, cache: Pat
     assert status(run)["state"] == "interrupted"
 
 
-@pytest.mark.slow
-def test_two_processes_train_into_one_run_directory(tmp_path: Path, cache: Path) -> None:
-    """Distributed data parallel, on the CPU: one run, one row an epoch, tested once."""
-    distributed = ["trainer.devices=2", "trainer.strategy=ddp"]
-    done = subprocess.run(
-        **script("train", *TINY, *distributed, "name=ddp", cwd=tmp_path, cache=cache), check=False, timeout=120
-    )
-    assert done.returncode == 0, done.stdout
-    run = only_run(tmp_path, "ddp")
-    assert status(run)["state"] == "finished"
-    assert [row["epoch"] for row in history(run)] == ["1", "2"]
-    assert [row["step"] for row in history(run)] == ["2", "4"]  # 8 pairs, two at a time in each of two processes
-    assert (run / "test" / "eigen" / "metrics.json").is_file()
-    assert done.stdout.count("epoch 2 of 2") == 1
-
-
 def test_a_gpu_that_fills_up(command: Command, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A resumed run is not blamed for it."""
 

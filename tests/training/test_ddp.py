@@ -89,11 +89,14 @@ def assert_same_metrics(one: Path, two: Path) -> None:
 @pytest.mark.usefixtures("no_norm")
 @pytest.mark.slow
 def test_two_processes_give_the_metrics_of_one(fractions: str, tmp_path: Path, cache: Path) -> None:
-    """Each with half the batch: the same pairs a step, the same history, the same test."""
+    """Each with half the batch: the same pairs a step, the same history, the same test, all of it once."""
     options = (*NO_NORM, fractions)
     one = trained("one", *options, "data.batch_size=4", folder=tmp_path, cache=cache)
     two = trained("two", *options, "data.batch_size=2", *TWO, folder=tmp_path, cache=cache)
     assert_same_metrics(one, two)
+    assert json.loads((two / "status.json").read_text())["state"] == "finished"
+    assert [row["step"] for row in history(two)] == [4, 8]
+    assert (two / "train.log").read_text().count("epoch 2 of 2") == 1
 
 
 @pytest.mark.slow
