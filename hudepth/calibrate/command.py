@@ -17,7 +17,7 @@ from hudepth.base.machine import torch_device, usable_cores
 from hudepth.base.options import Range, parse
 from hudepth.base.tables import Table
 from hudepth.calibrate.depths import focal_of, of_pairs, of_points
-from hudepth.calibrate.fitting import Measured, Trial, abs_rel, choose, try_kinds
+from hudepth.calibrate.fitting import Measured, Trial, abs_rel, check_unit, choose, try_kinds
 from hudepth.data.build import build_data
 from hudepth.export.bundle import write_bundle
 from hudepth.export.card import model_card
@@ -63,6 +63,8 @@ def calibrate(config: dict[str, Any]) -> None:
         what, camera = f"{sum(len(image.truth_m) for image in images)} points of {name}", options.camera
     else:
         assert source is not None
+        if source.name == "rooms" != checkpoint.data.get("source"):  # the default of data=
+            raise ConfigError("data: built-in rooms are no camera's. Pass data=<yours>, or points=<file>.")
         if source.name in {each.get("source") for each in (checkpoint.data, *checkpoint.data.get("before", []))}:
             log.warning("data: the model was trained on %s, so its errors there say little about others.", source.name)
         images, sizes = of_pairs(source, model, most=options.pairs)
@@ -70,6 +72,7 @@ def calibrate(config: dict[str, Any]) -> None:
     if not images:
         raise DataError(f"data: no measured depth within {model.info.max_depth_m:g} m. Check data.encoding.")
     focal = focal_of(camera, sizes) or (NYU_FOCAL if source and source.name in NYU_SOURCES else None)
+    check_unit(images)
     trials = try_kinds(images)
     _table(images, trials, what).show()
     kind = choose(trials)
@@ -90,15 +93,19 @@ def _uncalibrated(checkpoint: Checkpoint) -> Checkpoint:
 
 def _table(images: list[Measured], trials: Mapping[str, Trial], what: str) -> Table:
     before = sum(abs_rel(image) for image in images) / len(images)
+    named = any(image.scene for image in images)
     scenes = len({image.scene or image.id for image in images})
-    table = Table(("calibration", "abs_rel", "change", "95 % interval", "helps"), title=f"{what}, {scenes} scenes")
+    count = f"{scenes} scenes" if named else "no scenes named"
+    table = Table(("calibration", "abs_rel", "change", "95 % interval", "helps"), title=f"{what}, {count}")
     table.add("none", f"{before:.3f}", "", "", "")
     for kind, trial in trials.items():
         change = trial.change
         ends = "-" if math.isnan(change.high) else f"[{change.low:+.3f}, {change.high:+.3f}]"
         table.add(kind, f"{trial.abs_rel:.3f}", f"{change.value:+.3f}", ends, "yes" if trial.helps else "no")
-    few = f" Fewer than {MIN_SCENES} scenes give no interval." if scenes < MIN_SCENES else ""
-    table.caption = f"Each picture is corrected by a fit on other scenes.{few}"
+    of = "scenes" if named else "pictures"
+    few = f" Fewer than {MIN_SCENES} {of} give no interval." if scenes < MIN_SCENES else ""
+    alike = "" if named else " Pictures of one room make it look better than it is."
+    table.caption = f"Each picture is corrected by a fit on other {of}.{alike}{few}"
     return table
 
 

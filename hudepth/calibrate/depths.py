@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hudepth.base.camera import CameraChoice
-from hudepth.base.console import track
+from hudepth.base.console import log, track
 from hudepth.base.errors import DataError
 from hudepth.base.images import read_bytes
 from hudepth.calibrate.fitting import Measured
@@ -33,17 +33,21 @@ def of_pairs(source: Source, model: DepthModel, *, most: int) -> tuple[list[Meas
     """
     records = source.records()
     chosen = [records[round(i)] for i in np.linspace(0, len(records) - 1, min(most, len(records)))]
-    found, sizes = [], []
+    found, sizes, shares = [], [], []
     for record in track(chosen, total=len(chosen), what="predicting"):
         pair = source.read(record)
         truth = read_metres(source, record, pair.depth)
         pred = model.predict(pair.image, camera="training").metres
         if pred.shape != truth.shape:
             pred = np.asarray(cv2.resize(pred, (truth.shape[1], truth.shape[0])), np.float32)
+        shares.append(float((truth > model.info.max_depth_m).sum() / max(1, (truth > 0).sum())))
         measured = _measured(record.id, record.scene, pred, truth, limit_m=model.info.max_depth_m)
         if measured is not None:
             found.append(measured)
             sizes.append((pair.image.shape[0], pair.image.shape[1]))
+    if (beyond := float(np.mean(shares))) > 0.01:
+        limit = f"{model.info.max_depth_m:g} m, the model's largest depth"
+        log.warning("%.0f %% of the measured depth is beyond %s: left out", 100 * beyond, limit)
     return found, sizes
 
 

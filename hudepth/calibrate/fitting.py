@@ -25,6 +25,8 @@ from hudepth.metrics.summary import ImageTable
 
 Floats = NDArray[np.float64]
 FOLDS = 10
+MOST_RATIO = 4.0
+"""Of measured to predicted depth, on the mean of logarithms: other cameras and rooms differ by less, units by more."""
 MIN_LOG_SPREAD = 0.1
 """Standard deviation of log depth below which a power cannot be told from a scale."""
 
@@ -54,6 +56,16 @@ class Trial:
     def helps(self) -> bool:
         """Whether it lowers the error, beyond what other scenes might have shown if there is an interval."""
         return self.change.value < 0 if math.isnan(self.change.high) else self.change.high < 0
+
+
+def check_unit(images: Sequence[Measured]) -> None:
+    """Raise DataError if measured depth is so far from the predicted that it must be in another unit."""
+    ratio = math.exp(float(np.mean([np.mean(np.log(image.truth_m / image.pred_m)) for image in images])))
+    if not 1 / MOST_RATIO <= ratio <= MOST_RATIO:
+        raise DataError(
+            f"data: measured depth is {ratio:.3g} times what is predicted, so its unit is wrong. "
+            "Check data.encoding, or that the points are in metres."
+        )
 
 
 def fit_scale(images: Sequence[Measured]) -> Calibration | None:

@@ -61,7 +61,8 @@ def _describe(datamodule: DepthDataModule) -> Table:
     records = source.records()
     table = Table(("", ""), title=source.name, left=2)
     table.add("pairs", f"{len(records):,}")
-    table.add("scenes", f"{len({record.scene for record in records}):,}")
+    scenes = {record.scene for record in records if record.scene}
+    table.add("scenes", f"{len(scenes):,}" if scenes else "none named")
     own = Counter(record.split or "none" for record in records)
     table.add("official split", ", ".join(f"{n:,} {name}" for name, n in sorted(own.items())))
     if categories := Counter(record.category for record in records if record.category).most_common(6):

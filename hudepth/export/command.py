@@ -26,11 +26,10 @@ from hudepth.export.graphs import INPUT, export_onnx, export_openvino, export_pr
 from hudepth.export.int8_accuracy import measure_int8
 from hudepth.export.parity import Parity, check, compare
 from hudepth.export.quantise import check_calibration, quantise
-from hudepth.inference.backends import PT2, GraphBackend, TorchBackend, open_exported
+from hudepth.inference.backends import PT2, GraphBackend, TorchBackend, fast_form, open_exported
 from hudepth.inference.model import DepthModel
 from hudepth.inference.model_info import ModelInfo
 from hudepth.inference.runtimes import onnx_session
-from hudepth.models.inference import inference_form
 from hudepth.runs import hub
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 from hudepth.runs.results import read_metrics
@@ -106,10 +105,12 @@ def export(config: dict[str, Any]) -> None:
     if "int8" in options.format:
         check_calibration(options.calibration)
     checkpoint = load_checkpoint(options.checkpoint, runs=options.runs)
-    net = checkpoint.build_net(trust=options.trust)
-    info = ModelInfo.of_checkpoint(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=options.size)
+    trained = checkpoint.build_net(trust=options.trust)
+    parameters = sum(each.numel() for each in trained.parameters())
+    info = ModelInfo.of_checkpoint(checkpoint, parameters=parameters, size=options.size)
     torch.set_num_threads(usable_cores())
-    reference = TorchBackend(net, info, device=torch.device("cpu"))
+    net = fast_form(trained, size=info.size)
+    reference = TorchBackend(trained, info, device=torch.device("cpu"))
     images = find_images(
         checkpoint, folder=options.images, size=info.size, compared=options.compared,
         calibration=options.calibration if "int8" in options.format else 1,  # only int8 needs them
@@ -122,7 +123,6 @@ def export(config: dict[str, Any]) -> None:
     record: dict[str, Any] = {}
     try:
         with tempfile.TemporaryDirectory(prefix=f".export-{os.getpid()}-", dir=output) as folder:
-            net = inference_form(net, size=info.size)
             work = Work(options, checkpoint, net, reference, info, images, output, Path(folder))
             for name in options.format:
                 record[name] = MAKERS[name](work)

@@ -20,8 +20,8 @@ class Parity:
     mean_mm: float
 
     def __str__(self) -> str:
-        worst = f"at most {self.worst_mm:.3g} mm from the checkpoint"
-        return f"{worst} at any pixel of {self.images} images, {self.mean_mm:.2g} mm on average"
+        worst, mean = (f"{mm:.0f}" if mm >= 100 else f"{mm:.2g}" for mm in (self.worst_mm, self.mean_mm))
+        return f"at most {worst} mm from the checkpoint at any pixel of {self.images} images, {mean} mm on average"
 
 
 def compare(

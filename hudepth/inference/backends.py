@@ -117,7 +117,15 @@ class TorchBackend:
         """Return a checkpoint's network in its fastest form; raises HudepthError if it does not take the size."""
         net = checkpoint.build_net(trust=trust)
         info = ModelInfo.of_checkpoint(checkpoint, parameters=sum(p.numel() for p in net.parameters()), size=size)
-        return cls(inference_form(net.to(device), size=info.size), info, device=device, precision=precision)
+        return cls(fast_form(net.to(device), size=info.size), info, device=device, precision=precision)
+
+
+def fast_form(net: nn.Module, *, size: tuple[int, int]) -> nn.Module:
+    """Return :func:`inference_form`; the ConfigError of a size that it does not take names the option ``size``."""
+    try:
+        return inference_form(net, size=size)
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("data.size", "size")) from error
 
 
 class GraphBackend:

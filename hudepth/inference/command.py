@@ -99,7 +99,7 @@ def predict(config: dict[str, Any]) -> None:
     """Predict all inputs of conf/predict.yaml; raises HudepthError, for unreadable inputs once all others are done."""
     options = parse(PredictOptions, {**config, "runs": config["paths"]["runs"]})
     model = load_model(options)
-    if options.input is None:
+    if not options.input:
         raise ConfigError("input is not set. Pass input=<image | folder | video | camera>.")
     inputs = find_inputs(options.input, recursive=options.recursive, output=Path(options.output).expanduser())
     output = output_folder(options.output)
@@ -127,8 +127,8 @@ def predict(config: dict[str, Any]) -> None:
     finally:
         _report(job, seconds=time.monotonic() - start)
     if failed := len(job.tally.failed):
-        total = failed + job.tally.done
-        raise DataError(f"{failed} of {total} could not be predicted, see above; the rest is in '{output}'.")
+        rest = f"; the rest is in '{output}'" if job.tally.done else ""
+        raise DataError(f"{failed} failed, in whole or in part, see above{rest}.")
 
 
 def _predict_images(job: Job, items: list[Item]) -> None:
@@ -222,8 +222,7 @@ def _report(job: Job, *, seconds: float) -> None:
     record = {
         "model": {"name": info.name, "parameters": info.parameters, "epoch": info.epoch, **info.trained_on},
         "units": {"png16": "mm", "npy": "m", "uncertainty": "m", "ply": "m", "glb": "m"},
-        "network_size": list(info.size), "fit": job.model.fit,
-        "max_depth_m": info.max_depth_m,
+        "network_size": list(info.size), "fit": job.model.fit, "max_depth_m": info.max_depth_m,
         "calibration": info.calibration and asdict(info.calibration), "backend": job.model.backend.name,
         "settings": {
             "input": options.input, "camera": options.camera, "smoothing": options.smoothing,
@@ -244,7 +243,8 @@ def _report_cameras(job: Job) -> None:
         log.info("camera: %s; depth x %g (%d of %d)", origin, factor, count, len(job.cameras))
     if len(used) > 3:
         log.info("camera: %d others, see predictions.json", len(used) - 3)
-    if job.model.info.training_focal is None and any(each["known"] for each in job.cameras.values()):
+    known, scaled = [each["known"] for each in job.cameras.values()], job.model.info.training_focal is not None
+    if any(known) and not scaled:
         log.warning("camera: depth is not scaled, since that of this model's training or calibration is not known.")
-    elif job.options.camera == "auto" and not all(each["known"] for each in job.cameras.values()):
+    elif scaled and job.options.camera == "auto" and not all(known):
         log.info("camera: metres change with the field of view; state it with camera=fov=<degrees> or f35=<mm>")

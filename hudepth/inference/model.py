@@ -206,6 +206,8 @@ def load_model(chosen: ModelOptions) -> DepthModel:
     if path.suffix.lower() in EXPORTED and not path.is_dir():
         if chosen.size is not None:
             raise ConfigError(f"size: '{path.name}' has a fixed size. Leave size out.")
+        if chosen.device not in ("auto", "cpu"):
+            raise ConfigError(f"device={chosen.device}: exported files run on the CPU. Pass their checkpoint instead.")
         if not path.is_file():
             wanted = "a checkpoint, run directory, bundle or exported file"
             raise ConfigError(f"checkpoint: no file '{path}'. Pass {wanted}.")

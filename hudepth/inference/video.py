@@ -74,7 +74,9 @@ class FrameReader:
             yield np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
     def shortfall(self) -> str | None:
-        """Once all frames are read: return a line if the file ended before the number it states."""
+        """Once all frames are read: return a line if there are none, or fewer than the file states."""
+        if not self.read:
+            return "holds no frame that can be decoded"
         if self.expected is None or self.read >= self.expected - 1:  # containers round and may be off by one
             return None
         return f"ends after {self.read} of {self.expected} frames, the file is cut off or damaged; those were kept"

@@ -23,6 +23,7 @@ KEY = "hudepth"
 VERSION = 2
 """1: before the encoder and the head were renamed."""
 NET_PREFIX = "net."
+SUFFIXES = (".ckpt", ".pt", ".pth")
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,8 @@ def read_plain(path: Path) -> dict[str, Any]:
 
 def _check_archive(path: Path) -> None:
     """Refuse a damaged file before any of it is unpickled, and one that unpacks to more than its size."""
+    if not zipfile.is_zipfile(path) and path.suffix.lower() not in SUFFIXES:
+        raise CheckpointError(f"'{path}' is no checkpoint. Pass a run directory, checkpoint or bundle.")
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())

@@ -20,6 +20,8 @@ DEPTH_COLOURS = "turbo_r"
 ERROR_COLOURS = "magma"
 SCORE_COLOURS = "viridis"
 """Bright is better."""
+MIN_LEGEND = 40
+"""Height of a picture [pixels] below which a legend would not be legible."""
 UNMEASURED_COLOUR, UNMEASURED_GREY = "0.75", 191
 """A light grey that no scale contains, for matplotlib and in bytes."""
 
@@ -65,7 +67,9 @@ def colour_depth(
     picture = cv2.applyColorMap(shade, _colours())
     if not depth_m.all():
         picture[depth_m == 0] = UNMEASURED_GREY
-    return np.hstack([picture, _legend(depth_m.shape[0], near, far)]) if legend else np.asarray(picture, np.uint8)
+    if not legend or len(depth_m) < MIN_LEGEND:
+        return np.asarray(picture, np.uint8)
+    return np.hstack([picture, _legend(len(depth_m), near, far)])
 
 
 @lru_cache(maxsize=1)
@@ -84,11 +88,10 @@ def _legend(height: int, near: float, far: float) -> UInt8[np.ndarray, "h w 3"]:
     from matplotlib.ticker import MaxNLocator
     from PIL import Image, ImageDraw
 
-    unit = float(np.clip(height / 4, 40, 200)) / 72  # pixels per point
-    font = _font(max(1, round(8 * unit)))
-    ticks = [
-        tick for tick in MaxNLocator(nbins=9, steps=[1, 2, 2.5, 5, 10]).tick_values(near, far) if near <= tick <= far
-    ]
+    unit = max(height / 4, 80) / 72  # pixels per point; digits are at least 9 pixels high
+    font = _font(round(8 * unit))
+    locator = MaxNLocator(nbins=min(9, max(1, height // 18)), steps=[1, 2, 2.5, 5, 10])
+    ticks = [tick for tick in locator.tick_values(near, far) if near <= tick <= far]
     decimals = max((len(f"{tick:.6g}".partition(".")[2]) for tick in ticks), default=0)
     texts = [f"{tick:.{decimals}f}" for tick in ticks]
     bar, gap, margin = round(9 * unit), round(3 * unit), round(min(9 * unit, 0.2 * height))

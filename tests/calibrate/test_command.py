@@ -75,6 +75,40 @@ def test_what_does_not_help_is_not_stored(tiny: Path, mine: Path, command: Comma
     assert not Path("fitted").exists()
 
 
+@pytest.mark.parametrize("encoding", ["uint16_10000", "uint16_5000"])
+def test_a_wrong_unit_is_refused(encoding: str, tiny: Path, mine: Path, command: Command) -> None:
+    for file in (mine / "depths").iterdir():  # 0.4 times what is predicted, in millimetres
+        Image.fromarray((np.array(Image.open(file)) * (4 / 7)).astype(np.uint16)).save(file)
+    wrong = [each for each in DATA if "encoding" not in each]
+    done = command("data", "calibrate", f"checkpoint={tiny}", *wrong, f"data.encoding={encoding}", "output=fitted")
+    assert done.code == 1
+    factor = {"uint16_10000": 0.04, "uint16_5000": 0.08}[encoding]
+    line = f"hudepth-data: data: measured depth is {factor:g} times what is predicted, so its unit is wrong."
+    assert done.err.splitlines()[-1].startswith(line)
+    assert not Path("fitted").exists()
+
+
+def test_built_in_rooms_calibrate_no_model_of_other_data(tiny: Path, command: Command) -> None:
+    done = command("data", "calibrate", f"checkpoint={tiny}")
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        "hudepth-data: data: built-in rooms are no camera's. Pass data=<yours>, or points=<file>."
+    )
+
+
+def test_what_the_fit_leaves_out_and_how_it_is_checked_is_said(tiny: Path, mine: Path, command: Command) -> None:
+    for file in (mine / "depths").iterdir():
+        depth = np.array(Image.open(file))
+        depth[:12] = 30_000  # a quarter
+        Image.fromarray(depth).save(file)
+    done = command("data", "calibrate", f"checkpoint={tiny}", *DATA, "output=fitted")
+    assert done.code == 0, done.err
+    assert "25 % of the measured depth is beyond 10 m, the model's largest depth: left out" in done.err
+    assert "8 pairs of folder, no scenes named" in done.out
+    said = " ".join(done.out.split())
+    assert "Each picture is corrected by a fit on other pictures. Pictures of one room make it look better" in said
+
+
 def test_points_will_do(tiny: Path, mine: Path, command: Command) -> None:
     model, lines = hudepth.load(tiny), ["image,x,y,metres"]
     for number in range(6):

@@ -86,8 +86,7 @@ def test_what_is_bad_is_listed_and_the_rest_is_done(tiny: Path, photos: Path, co
         assert line in done.err
     assert "cut.avi': ends after" in done.err
     last = done.err.splitlines()[-1]
-    assert last.startswith("hudepth-predict: 4 of ")
-    assert last.endswith(" could not be predicted, see above; the rest is in 'out'.")
+    assert last == "hudepth-predict: 4 failed, in whole or in part, see above; the rest is in 'out'."
     assert sorted(file.name for file in Path("out").glob("*.npy")) == [
         "a_depth.npy",
         "grey tall_depth.npy",
@@ -97,6 +96,30 @@ def test_what_is_bad_is_listed_and_the_rest_is_done(tiny: Path, photos: Path, co
     assert set(json.loads(Path("out/predictions.json").read_text())["failed"]) == {
         f"photos/{name}" for name in ("empty.png", "cut.png", "text.jpg", "cut.avi")
     }
+
+
+def test_a_video_without_frames_is_no_success(tiny: Path, command: Command) -> None:
+    film(Path("none.avi"), 0)
+    done = command("predict", f"checkpoint={tiny}", "input=none.avi", "output=out")
+    assert done.code == 1
+    assert "'none.avi': " in done.err
+    assert done.err.splitlines()[-1] == "hudepth-predict: 1 failed, in whole or in part, see above."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("input=",), "input is not set. Pass input=<image | folder | video | camera>."),
+        (("input=photos", "size=100"), "size: images of 100 x 100 (height x width), but both sides must be "),
+        (("input=photos", "checkpoint=photos/a.png"), "'photos/a.png' is no checkpoint. Pass a run directory, "),
+        (("input=photos", "checkpoint=no.onnx", "device=cuda"), "device=cuda: exported files run on the CPU."),
+    ],
+)
+def test_mistakes_name_what_was_passed(arguments: tuple[str, ...], line: str, photos: Path, command: Command) -> None:
+    Path("no.onnx").write_bytes(b"")
+    done = command("predict", "checkpoint=nyu", "output=out", *arguments)
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith(f"hudepth-predict: {line}")
 
 
 def test_what_cannot_be_written_is_named_and_the_rest_is_done(tiny: Path, photos: Path, command: Command) -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from matplotlib import colormaps
 
 from hudepth.base.errors import ConfigError
-from hudepth.viz.colour import UNMEASURED_GREY, auto_scale, colour_depth
+from hudepth.viz.colour import MIN_LEGEND, UNMEASURED_GREY, auto_scale, colour_depth
 
 TURBO = np.array([colormaps["turbo_r"](i / 255)[:3] for i in range(256)]) * 255
 
@@ -28,7 +28,12 @@ def test_near_is_red_and_far_is_blue_and_unmeasured_is_grey() -> None:
     assert (none == UNMEASURED_GREY).all()
 
 
-@pytest.mark.parametrize("height", [7, 48, 480, 1080])
+def test_a_legend_that_would_not_be_legible_is_left_out() -> None:
+    for height, there in ((MIN_LEGEND - 1, False), (MIN_LEGEND, True)):
+        assert (colour_depth(np.ones((height, 20), np.float32), scale_m=(0, 10)).shape[1] > 20) is there
+
+
+@pytest.mark.parametrize("height", [48, 480, 1080])
 def test_the_legend_stands_beside_it_and_is_the_same_for_every_picture(height: int) -> None:
     first = colour_depth(np.full((height, 20), 2.0, np.float32), scale_m=(0, 10))
     second = colour_depth(np.full((height, 20), 5.0, np.float32), scale_m=(0, 10))

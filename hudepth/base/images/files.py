@@ -46,6 +46,8 @@ def check_file(path: Path) -> None:
         DataError: if it is missing or larger than :data:`MAX_FILE_BYTES`.
     """
     if not path.is_file():
+        if path.is_dir():
+            raise DataError(f"'{path}' is a folder. Pass a file of it.")
         raise DataError(f"no file '{path}'. Copy it there, or take it off the list.")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise DataError(f"'{path}': larger than {MAX_FILE_BYTES >> 20} MiB. It cannot be one depth map or list.")
