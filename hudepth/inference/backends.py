@@ -121,7 +121,7 @@ class TorchBackend:
 
 
 def fast_form(net: nn.Module, *, size: tuple[int, int]) -> nn.Module:
-    """Return :func:`inference_form`; the ConfigError of a size that it does not take names the option ``size``."""
+    """Return :func:`hudepth.models.inference.inference_form`; a ConfigError of its size names the option ``size``."""
     try:
         return inference_form(net, size=size)
     except ConfigError as error:
