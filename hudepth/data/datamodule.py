@@ -64,6 +64,7 @@ class DepthDataModule(LightningDataModule):
     """
 
     _told = False
+    _draws: tuple[int, torch.Generator] | None = None
 
     def __init__(
         self,
@@ -114,7 +115,6 @@ class DepthDataModule(LightningDataModule):
             source.unpaired = []
         added = {"stream": self.stream, "teacher": self.teacher_folder, "pictures": self.pictures_folder}
         check_together(source, **added, on_device=self.on_device, shuffle_block=self.shuffle_block)
-        self._draws: tuple[int, torch.Generator] | None = None
         self._training_batches = TrainingBatches(augment, max_depth_m=self.max_depth_m)
 
     @cached_property
