@@ -1,1 +1,1 @@
-"""Data sets of the field, each read in the layout of its own archives."""
+"""Public data sets, each read in the layout of its own archives."""

@@ -1,4 +1,4 @@
-"""What the sets of the field share: pairs found by the names of their files, lists of a split, masks."""
+"""What public data sets share: pairs found by the names of their files, lists of a split, masks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each set of the field on a tiny tree in its own layout: right depth in the store, or one clear line."""
+"""Each public data set on a tiny tree in its own layout: right depth in the store, or one clear line."""
 
 from __future__ import annotations
 

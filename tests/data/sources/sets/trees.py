@@ -1,4 +1,4 @@
-"""Tiny trees of the sets of the field, each in the layout of its own archives."""
+"""Tiny trees of public data sets, each in the layout of its own archives."""
 
 from __future__ import annotations
 
