@@ -163,7 +163,7 @@ def test_every_command_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(sys, "argv", words)
         assert getattr(cli, words[0].removeprefix("hudepth-"))() == 0, command
     jobs = list(folder.glob("terms/*/status.json"))
-    assert len(jobs) == 9
+    assert len(jobs) == 4
     assert all(json.loads(job.read_text())["state"] == "finished" for job in jobs)
 
 

@@ -20,7 +20,7 @@ DEPTH_COLOURS = "turbo_r"
 ERROR_COLOURS = "magma"
 SCORE_COLOURS = "viridis"
 """Bright is better."""
-MIN_LEGEND = 60
+MIN_LEGEND = 48
 """Height of a picture [pixels] below which a legend would not be legible."""
 UNMEASURED_COLOUR, UNMEASURED_GREY = "0.75", 191
 """A light grey that no scale contains, for matplotlib and in bytes."""

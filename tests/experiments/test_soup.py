@@ -48,9 +48,9 @@ def test_the_soup_is_no_worse_on_validation_and_can_be_tested(command: Command, 
     assert command("test", f"checkpoint={tmp_path / 'soup.ckpt'}", "protocol=paper").code == 0
     past = [each["split"]["sha256"] for path in made_of for each in lineage(load_checkpoint(path))]
     assert [each["split"]["sha256"] for each in lineage(soup)] == past
-    with pytest.raises(ConfigError, match=r"^'.*bundles/nyu' is of another network than '.*'\."):
+    with pytest.raises(ConfigError, match=r"^'.*/nyu' is of another network than '.*'\."):
         make_soup(tmp_path / "other.ckpt", [runs[0], "nyu"], protocol="paper", metric="abs_rel")
-    with pytest.raises(ConfigError, match=r"^'.*bundles/nyu' is a bundle\."):
+    with pytest.raises(ConfigError, match=r"^'.*/nyu' is a bundle\."):
         make_soup(tmp_path / "other.ckpt", ["nyu"], protocol="paper", metric="abs_rel")
     with pytest.raises(ConfigError, match=r"^no folder '.*nowhere' to write"):
         make_soup(tmp_path / "nowhere/soup.ckpt", runs, protocol="paper", metric="abs_rel")
