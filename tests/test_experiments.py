@@ -250,6 +250,17 @@ def test_what_the_study_of_the_network_for_cpus_says() -> None:
     assert len(json.loads((study / "scored.json").read_text())) == 1
 
 
+def test_no_further_option_helps_beyond_scenes() -> None:
+    page = (STUDIES / "lite_options" / "README.md").read_text()
+    for marker, count in (("short", 8), ("late", 2)):
+        rows = page.split(f"<!-- {marker} -->\n")[1].splitlines()
+        changes = [line.split("|")[-3:-1] for line in rows if re.match(r"\| \w+ \| 0\.", line)][1:]
+        assert len(changes) == count
+        for cell in (cell for pair in changes for cell in pair):
+            low, high = (float(end) for end in re.findall(r"[+-]\d\.\d+", cell)[1:])
+            assert low <= 0 <= high
+
+
 def test_the_estimate_of_long_trainings_follows_from_what_was_measured() -> None:
     page = (STUDIES.parent / "docs" / "scale.md").read_text()
     assert page.split("<!-- estimate -->\n")[1].strip() == load(STUDIES / "speed" / "scale_estimate.py").estimate()

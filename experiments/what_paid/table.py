@@ -17,6 +17,13 @@ PAGES = (
     ("rooms_curve", "results", "wide_8k", "8,192 rooms before real images, `lite`", "validation"),
     ("rooms_curve", "results", "wide_32k", "32,768 rooms", "validation"),
     ("rooms_curve", "results", "homes_32k", "32,768 rooms with clutter and a worse camera", "validation"),
+    ("lite_options", "short", "heads", "heads for normals and edges, `lite`, a short training", "validation"),
+    ("lite_options", "short", "image_scale", "a loss of the scale of images, the same", "validation"),
+    ("lite_options", "short", "scale_head", "a scale head, the same", "validation"),
+    ("lite_options", "short", "wider_view", "zooming from 0.8 instead of 1, the same", "validation"),
+    ("lite_options", "short", "no_zoom", "no zooming, the same", "validation"),
+    ("lite_options", "short", "base_seed2", "only another seed, the same", "validation"),
+    ("lite_options", "late", "image_scale", "a loss of the scale of images in a late cycle, `lite`", "validation"),
     ("lite_official", "validation", "third", "a narrower decoder and a third cycle, `lite`", "validation"),
 )
 COMPARED = (
