@@ -114,7 +114,7 @@ def test_ctrl_c_ends_between_two_batches_and_says_how_to_go_on(tmp_path: Path, c
 @pytest.mark.slow
 def test_a_worker_that_is_killed_costs_no_other_job(tmp_path: Path, cache: Path) -> None:
     """As when memory runs out: joblib gives up its whole pool, and what had not begun is launched anew."""
-    epochs = ("trainer.max_epochs=300", "loss=l1,l2", "seed=1,2", "sweep_dir=s", "hydra/launcher=joblib")
+    epochs = ("trainer.max_epochs=100", "loss=l1,l2", "seed=1,2", "sweep_dir=s", "hydra/launcher=joblib")
     process = start(tmp_path, cache, "-m", *FAST, *epochs, "hydra.launcher.n_jobs=2")
     wait_for(lambda: len(list(tmp_path.glob("s/*/metrics.csv"))) == 2)
     victim = min(tmp_path.glob("s/*/status.json"))
