@@ -63,7 +63,7 @@ def calibrate(config: dict[str, Any]) -> None:
         what, camera = f"{sum(len(image.truth_m) for image in images)} points of {name}", options.camera
     else:
         assert source is not None
-        if source.name == "rooms" != checkpoint.data.get("source"):  # the default of data=
+        if source.name == "rooms" and checkpoint.data.get("source") != "rooms":  # the default of data=
             raise ConfigError("data: built-in rooms are no camera's. Pass data=<yours>, or points=<file>.")
         if source.name in {each.get("source") for each in (checkpoint.data, *checkpoint.data.get("before", []))}:
             log.warning("data: the model was trained on %s, so its errors there say little about others.", source.name)

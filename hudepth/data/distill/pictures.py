@@ -98,7 +98,8 @@ class Pictures:
 
 def _find_pictures(root: Path, teacher: Path) -> list[Path]:
     """Return the JPEG and PNG files of a folder, but no hidden ones and none of the teacher's; count the others."""
-    there = [path for path in sorted(root.rglob("[!.]*")) if path.is_file() and teacher not in path.parents]
+    taught = teacher.resolve()
+    there = [path for path in sorted(root.rglob("[!.]*")) if path.is_file() and taught not in path.resolve().parents]
     others = [path.name for path in there if path.suffix.lower() not in IMAGE_SUFFIXES]
     files = [path for path in there if path.suffix.lower() in IMAGE_SUFFIXES]
     if not files:
