@@ -22,6 +22,7 @@ PAGES = (
     ("lite_options", "short", "scale_head", "a scale head, the same", "validation"),
     ("lite_options", "short", "wider_view", "zooming from 0.8 instead of 1, the same", "validation"),
     ("lite_options", "short", "no_zoom", "no zooming, the same", "validation"),
+    ("lite_options", "short", "fields_of_view", "rooms seen by cameras of 45 to 75 degrees, the same", "validation"),
     ("lite_options", "short", "base_seed2", "only another seed, the same", "validation"),
     ("lite_options", "late", "image_scale", "a loss of the scale of images in a late cycle, `lite`", "validation"),
     ("lite_official", "validation", "third", "a narrower decoder and a third cycle, `lite`", "validation"),
