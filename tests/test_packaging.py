@@ -132,7 +132,7 @@ def test_every_dependency_has_a_lower_bound_with_its_reason_and_a_tested_version
     ("code", "heavy"),
     [
         ("import hudepth.data.prepare, hudepth.data.sources.rooms, hudepth.data.sources.densedepth", "torch"),
-        ("import hudepth; hudepth.load('nyu')", "torchmetrics"),
+        ("import hudepth; hudepth.load('nyu'); hudepth.load('nyu_lite')", "torch._dynamo"),
     ],
     ids=["worker", "predict"],
 )

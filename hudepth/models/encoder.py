@@ -28,6 +28,14 @@ def run_stage(module: nn.Module, *inputs: Tensor) -> Any:
     return module(*inputs)
 
 
+def draw_kernels(net: nn.Module) -> None:
+    """Draw the kernels of all convolutions from He et al.'s normal distribution (2015), over outputs."""
+    for module in net.modules():
+        # On the meta device nothing would be drawn, but a second's worth of torch be imported.
+        if isinstance(module, nn.Conv2d) and not module.weight.is_meta:
+            nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+
 NORMS = {"trained": False, "frozen": True}
 """Values of ``model.encoder_norm``: whether batch norm keeps its initial statistics."""
 

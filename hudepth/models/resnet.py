@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hudepth.base.console import log
 from hudepth.base.errors import CheckpointError
-from hudepth.models.encoder import Encoder, Stage, run_stage
+from hudepth.models.encoder import Encoder, Stage, draw_kernels, run_stage
 from hudepth.models.weights import load_fitting, read_state
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
@@ -69,9 +69,7 @@ class ResNet18Encoder(Encoder):
             self.add_module(f"layer{i}", nn.Sequential(first, BasicBlock(channels, channels)))
             self.stages = (*self.stages, Stage(f"layer{i}", channels, 2 ** (i + 1), (f"layer{i}",)))
             width = channels
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        draw_kernels(self)
         self.train()  # applies frozen norms from the start
 
     @classmethod
