@@ -48,6 +48,8 @@ def calibrate(config: dict[str, Any]) -> None:
     options = parse(CalibrateOptions, config)
     if options.camera is not None:
         CameraChoice.of(options.camera)
+    if options.points and any(word.lstrip("+~").startswith("data") for word in config["overrides"]):
+        raise ConfigError("data, points: both are set. Pass one of them.")
     source = None if options.points else build_data(options.data, trust=options.trust).source
     name = options.points.stem if options.points else source.name if source else ""
     output = Path(options.output or f"calibrated_{name}").expanduser()

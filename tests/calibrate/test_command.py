@@ -96,6 +96,12 @@ def test_built_in_rooms_calibrate_no_model_of_other_data(tiny: Path, command: Co
     )
 
 
+def test_either_points_or_data_are_given(tiny: Path, mine: Path, command: Command) -> None:
+    done = command("data", "calibrate", f"checkpoint={tiny}", *DATA, "points=mine/points.csv")
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == "hudepth-data: data, points: both are set. Pass one of them."
+
+
 def test_what_the_fit_leaves_out_and_how_it_is_checked_is_said(tiny: Path, mine: Path, command: Command) -> None:
     for file in (mine / "depths").iterdir():
         depth = np.array(Image.open(file))
