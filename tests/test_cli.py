@@ -68,7 +68,7 @@ def run(task: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
         ("train", ["data=nyu_labelled"], "data: no 'nyu_labelled'. Did you mean 'nyu_labeled'? Pass one of de"),
         ("train", ["experiment=badcll"], "experiment: no 'badcll'. Did you mean 'badcl'? Pass one of badcl, demo,"),
         ("train", ["+experiment=demoo"], "experiment: no 'demoo'. Did you mean 'demo'? Pass one of badcl, demo,"),
-        ("train", ["-m", "loss=l3,l4"], "loss: no 'l3'. Pass one of badcl, berhu, gradient, image_scale, l1,"),
+        ("train", ["-m", "loss=l3,l4"], "loss: no 'l3'. Pass one of badcl, berhu, edges, gradient, image_scale, l1,"),
         ("train", ["just words"], "cannot read 'just words': write key=value, and quote values with"),
         ("test", [], "checkpoint is not set. Pass checkpoint=<file | run directory | last>, or predictions=<folder"),
         ("test", ["checkpoint=nowhere.ckpt"], "checkpoint: no file or run directory 'nowhere.ckpt'. Pass a "),

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from hudepth.base.masked import full_precision, widen, widest_float
+from hudepth.base.sobel import squared_sobel, whole_neighbourhoods
 from hudepth.base.types import DepthMap, Mask
 from hudepth.metrics.canny import canny_edges, chamfer_px
 from hudepth.metrics.depth import MIN_DEPTH_M
@@ -130,19 +131,10 @@ def depth_boundary_errors(
 
 def _squared_slopes(pred_m: Tensor, target_m: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """fx^2 + fy^2 [m^2] of both maps, without the border; 0 where a window holds an invalid pixel."""
-    rows = valid[..., :-2, :] & valid[..., 1:-1, :] & valid[..., 2:, :]
-    whole = rows[..., :-2] & rows[..., 1:-1] & rows[..., 2:]
-    slopes = (_squared_sobel(torch.where(valid, full_precision(x), 0.0)) for x in (pred_m, target_m))
+    whole = whole_neighbourhoods(valid)
+    slopes = (squared_sobel(torch.where(valid, full_precision(x), 0.0)) for x in (pred_m, target_m))
     pred, target = (torch.where(whole, slope, 0.0) for slope in slopes)
     return pred, target
-
-
-def _squared_sobel(x: DepthMap) -> Float[Tensor, "b 1 rows columns"]:
-    smooth = x[..., :-2, :] + 2 * x[..., 1:-1, :] + x[..., 2:, :]
-    across = smooth[..., 2:] - smooth[..., :-2]
-    smooth = x[..., :-2] + 2 * x[..., 1:-1] + x[..., 2:]
-    down = smooth[..., 2:, :] - smooth[..., :-2, :]
-    return across.square() + down.square()
 
 
 def _edge_scores(pred: Tensor, target: Tensor, threshold: float) -> dict[str, Tensor]:

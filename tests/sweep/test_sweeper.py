@@ -120,14 +120,14 @@ def test_a_job_that_is_refused_before_it_starts_leaves_a_status_too(command: Com
 def test_a_value_that_does_not_compose_stops_no_other(command: Command, tmp_path: Path) -> None:
     done = sweep(command, "loss=l1,l3")
     assert done.code == 1
-    line = "loss=l3: loss: no 'l3'. Pass one of badcl, berhu, gradient, image_scale, l1, l2, mixture, silog."
+    line = "loss=l3: loss: no 'l3'. Pass one of badcl, berhu, edges, gradient, image_scale, l1, l2, mixture, silog."
     assert done.err.splitlines()[0] == line
     assert done.err.splitlines()[-1] == f"hudepth-train: 1 of 2 jobs failed: {line} See s/*/train.log."
     assert states(tmp_path / "s") == {"l1": "finished"}
     assert [job for job in read_jobs(tmp_path / "s")["tried"] if "run" not in job] == [
         {
             "labels": {"loss": "l3"},
-            "error": "loss: no 'l3'. Pass one of badcl, berhu, gradient, image_scale, l1, l2, mixture, silog.",
+            "error": "loss: no 'l3'. Pass one of badcl, berhu, edges, gradient, image_scale, l1, l2, mixture, silog.",
         }
     ]
 
