@@ -1,6 +1,6 @@
 """Compare checkpoints on the validation pairs of their split, with 95 % intervals over scenes.
 
-    python -m experiments.validation name=<run> name=<run> ... [--protocol eigen] [--page README.md]
+    python -m experiments.validation name=<run> name=<run> ... [--protocol eigen] [--also METRIC] [--page README.md]
 
 Choices are made on these pairs, so that the test images are looked at once. All checkpoints must have the same data
 and split; each sees images of the size that it was trained at, so only protocols at native resolution compare sizes.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from hudepth.models.inference import inference_form
 from hudepth.runs.checkpoint import Checkpoint, load_checkpoint
 
 SHOWN = ("abs_rel", "rmse", "delta1", "scale_sd", "abs_rel_aligned")
+CHANGES = ("abs_rel", "delta1")
 
 
 def validation_data(checkpoints: Mapping[str, Checkpoint]) -> DepthDataModule:
@@ -60,22 +61,28 @@ class Validation:
             raise ConfigError(f"--protocol {protocol}: the first checkpoint was trained with {', '.join(stated)}.")
         (self.protocol,) = build_protocols({protocol: stated[protocol]}, datamodule=self.data, trust=[])
 
-    def score(self, nets: Mapping[str, nn.Module]) -> dict[str, ImageTable]:
-        """Return the metrics of each image by name of the network."""
+    def score(self, nets: Mapping[str, nn.Module], *, edges: bool = False) -> dict[str, ImageTable]:
+        """Return the metrics of each image by name of the network; of the first one also those of depth ``edges``."""
         fast = {f"{i}": inference_form(net, size=self.data.size) for i, net in enumerate(nets.values())}  # no dots
-        evaluation = Evaluation(fast, [self.protocol], max_depth_m=self.data.max_depth_m)
+        evaluation = Evaluation(
+            fast, [self.protocol], max_depth_m=self.data.max_depth_m, detailed="0" if edges else None
+        )
         run_evaluation(evaluation, self.data, {"accelerator": "cpu"})
         records = [self.data.store.records[index] for index in evaluation.indices]
-        sums = [evaluation.sums[i, self.protocol.name] for i in fast]
-        return {name: image_table(self.protocol, each, records) for name, each in zip(nets, sums, strict=True)}
+        boundary = [evaluation.boundary.get(self.protocol.name), *[None] * (len(nets) - 1)]
+        return {
+            name: image_table(self.protocol, evaluation.sums[i, self.protocol.name], records, boundary=edge)
+            for name, i, edge in zip(nets, fast, boundary, strict=True)
+        }
 
     def summarise(self, table: ImageTable) -> dict[str, float]:
         """Return the metrics of all images."""
         return summarise(table, **self.protocol.summary_options)
 
 
-def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -> list[str]:
-    """Return the lines of the table."""
+def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen", also: Sequence[str] = ()) -> list[str]:
+    """Return the lines of the table; ``also`` names further metrics, which are shown with their changes."""
+    shown, changes = (*SHOWN, *also), (*also, *CHANGES)
     stated = next(iter(checkpoints.values())).config["protocol"]
     alone = {name: Validation({name: each}, protocol=protocol, stated=stated) for name, each in checkpoints.items()}
     validation = next(iter(alone.values()))
@@ -84,15 +91,21 @@ def compare(checkpoints: Mapping[str, Checkpoint], *, protocol: str = "eigen") -
         if not same or other.data.split.sha256 != validation.data.split.sha256:
             what = "split" if same else "size, at which this protocol scores,"
             raise ConfigError(f"{name}: another {what} than {next(iter(alone))}.")
-    tables = {name: alone[name].score({name: each.build_net(trust=[])})[name] for name, each in checkpoints.items()}
+    tables = {
+        name: alone[name].score({name: each.build_net(trust=[])}, edges=bool(also))[name]
+        for name, each in checkpoints.items()
+    }
     options = validation.protocol.summary_options
     first, *_ = tables.values()
-    lines = [f"| | {' | '.join(SHOWN)} | change of abs_rel | change of delta1 |", f"|---|{'---|' * (len(SHOWN) + 2)}"]
+    if unknown := set(also) - set(validation.summarise(first)):
+        raise ConfigError(f"--also {min(unknown)}: {protocol} does not measure it.")
+    heads = ["", *shown, *(f"change of {key}" for key in changes)]
+    lines = [f"| {' | '.join(heads)} |".replace("|  |", "| |"), f"|{'---|' * len(heads)}"]
     for name, table in tables.items():
         values, ranges = validation.summarise(table), intervals(table, **options)
-        cells = [f"{values[key]:.3f} ({ranges[key][0]:.3f} to {ranges[key][1]:.3f})" for key in SHOWN]
+        cells = [f"{values[key]:.3f} ({ranges[key][0]:.3f} to {ranges[key][1]:.3f})" for key in shown]
         change = paired_differences(first, table, **options)
-        for key in ("abs_rel", "delta1"):
+        for key in changes:
             each = change[key]
             cells.append("" if table is first else f"{each.value:+.3f} ({each.low:+.3f} to {each.high:+.3f})")
         lines.append(f"| {name} | {' | '.join(cells)} |")
@@ -104,11 +117,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="+", help="name=<checkpoint or run directory>")
     parser.add_argument("--protocol", default="eigen")
+    parser.add_argument("--also", nargs="*", default=[], metavar="METRIC", help="further metrics, as edge_f1_0.25")
     parser.add_argument("--page", type=Path, help="a Markdown page; the table goes between its markers")
     parser.add_argument("--marker", default="results", help="name of the markers")
     options = parser.parse_args()
     named = dict(each.split("=", 1) for each in options.checkpoints)
-    lines = compare({name: load_checkpoint(path) for name, path in named.items()}, protocol=options.protocol)
+    checkpoints = {name: load_checkpoint(path) for name, path in named.items()}
+    lines = compare(checkpoints, protocol=options.protocol, also=options.also)
     print("\n".join(lines))
     if options.page:
         write_between(options.page, options.marker, "\n".join(lines))

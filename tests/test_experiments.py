@@ -261,6 +261,21 @@ def test_no_further_option_helps_beyond_scenes() -> None:
             assert low <= 0 <= high
 
 
+def test_what_the_study_of_the_loss_of_edges_says() -> None:
+    page = (STUDIES / "edge_loss" / "README.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    head, table = rows[0], {row[0]: row for row in rows[1:]}
+    before, after = (float(table[name][head.index("edge_f1_0.25")].split()[0]) for name in ("base", "edges"))
+    assert f"at 0.25 rises by {100 * (after / before - 1):.0f} %" in page
+    ends = {
+        name: tuple(float(end) for end in re.findall(r"[+-]\d\.\d+", table["edges"][head.index(f"change of {name}")]))
+        for name in ("abs_rel", "delta1", "dbe_acc_px", "edge_f1_0.25")
+    }
+    assert f"abs_rel rises by {ends['abs_rel'][0]:.3f}" in page
+    assert ends["delta1"][1] <= 0 <= ends["delta1"][2]
+    assert ends["dbe_acc_px"][2] < 0 < ends["edge_f1_0.25"][1]
+
+
 def test_the_estimate_of_long_trainings_follows_from_what_was_measured() -> None:
     page = (STUDIES.parent / "docs" / "scale.md").read_text()
     assert page.split("<!-- estimate -->\n")[1].strip() == load(STUDIES / "speed" / "scale_estimate.py").estimate()

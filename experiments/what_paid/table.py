@@ -25,6 +25,7 @@ PAGES = (
     ("lite_options", "short", "fields_of_view", "rooms seen by cameras of 45 to 75 degrees, the same", "validation"),
     ("lite_options", "short", "base_seed2", "only another seed, the same", "validation"),
     ("lite_options", "late", "image_scale", "a loss of the scale of images in a late cycle, `lite`", "validation"),
+    ("edge_loss", "results", "edges", "a loss of depth edges in a late cycle, the paper's network", "validation"),
     ("lite_official", "validation", "third", "a narrower decoder and a third cycle, `lite`", "validation"),
 )
 COMPARED = (

@@ -37,5 +37,14 @@ def test_checkpoints_are_compared_on_the_validation_pairs(command: Command, tmp_
     assert len(compare({"a": checkpoints["a"], "b": checkpoints["b"]}, protocol="paper")) == len(lines)
     with pytest.raises(ConfigError, match=r"^c: another split"):
         compare({name: checkpoints[name] for name in "ac"}, protocol="paper")
+    further = compare({name: checkpoints[name] for name in "ab"}, protocol="paper", also=["edge_f1_0.25", "log10"])
+    assert further[0] == (
+        "| | abs_rel | rmse | delta1 | scale_sd | abs_rel_aligned | edge_f1_0.25 | log10 "
+        "| change of edge_f1_0.25 | change of log10 | change of abs_rel | change of delta1 |"
+    )
+    assert {row.count("|") for row in further[:4]} == {13}
+    assert [row.split("|")[-3:] for row in further[2:4]] == [row.split("|")[-3:] for row in lines[2:4]]
+    with pytest.raises(ConfigError, match=r"^--also edge: paper does not measure it\.$"):
+        compare({"a": checkpoints["a"]}, protocol="paper", also=["edge"])
     with pytest.raises(ConfigError, match=r"^--protocol kitti: the first checkpoint was trained with paper"):
         compare({"a": checkpoints["a"]}, protocol="kitti")
