@@ -29,32 +29,37 @@ PAGES = (
     ("lite_official", "validation", "third", "a narrower decoder and a third cycle, `lite`", "validation"),
 )
 COMPARED = (
-    ("lite_official", "that, and 90 more images in a fourth cycle, `lite`", "test"),
-    ("equal_budget", "`experiment=strong` instead of the paper's recipe, on as many images", "test"),
+    ("lite_official/compare", "that, and 90 more images in a fourth cycle, `lite`", "test"),
+    ("strong_official/compare", "a fourth cycle, with a loss of depth edges, the paper's network", "test"),
+    ("lite_official/compare_edges", "a fifth cycle, with a loss of depth edges, `lite`", "test"),
+    ("equal_budget/compare", "`experiment=strong` instead of the paper's recipe, on as many images", "test"),
 )
+METRICS = ("abs_rel", "delta1", "edge_f1_0.25")
 
 
 def cells(study: str, marker: str, row: str) -> list[str]:
-    """Return the last two columns of a row in a study's table: the changes of abs_rel and delta1."""
+    """Return the changes of METRICS from a row of a study's table; empty where it has none."""
     table = (STUDIES / study / "README.md").read_text(encoding="utf-8").split(f"<!-- {marker} -->\n")[1]
-    (line,) = [line for line in table.splitlines() if line.startswith(f"| {row} |")]
-    return [cell.strip() for cell in line.split("|")[-3:-1]]
+    head, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if "|" in line]
+    (line,) = [line for line in rows if line[0] == row]
+    changes = dict(zip(head, line, strict=True))
+    return [changes.get(f"change of {name}", "") for name in METRICS]
 
 
-def differences(study: str) -> list[str]:
-    """Return the changes of abs_rel and delta1 between two runs that hudepth-report compared."""
-    document = json.loads((STUDIES / study / "compare" / "compare.json").read_text(encoding="utf-8"))
-    rows = [document["metrics"][name] for name in ("abs_rel", "delta1")]
+def differences(folder: str) -> list[str]:
+    """Return the changes of METRICS between two runs that hudepth-report compared."""
+    document = json.loads((STUDIES / folder / "compare.json").read_text(encoding="utf-8"))
+    rows = [document["metrics"][name] for name in METRICS]
     return [f"{row['difference']:+.3f} ({row['low']:+.3f} to {row['high']:+.3f})" for row in rows]
 
 
 def table() -> str:
     """Return the table in Markdown."""
-    lines = ["| change | on | abs_rel | delta1 |", "|---|---|---|---|"]
+    lines = ["| change | on | abs_rel | delta1 | edges, F1 at 0.25 |", "|---|---|---|---|---|"]
     for study, marker, row, change, where in PAGES:
         lines.append(f"| {change} | [{where}](../{study}) | {' | '.join(cells(study, marker, row))} |")
-    for study, change, where in COMPARED:
-        lines.append(f"| {change} | [{where}](../{study}) | {' | '.join(differences(study))} |")
+    for folder, change, where in COMPARED:
+        lines.append(f"| {change} | [{where}](../{folder.split('/')[0]}) | {' | '.join(differences(folder))} |")
     return "\n".join(lines)
 
 
