@@ -18,7 +18,7 @@ from hudepth.runs.history import read_history
 from hudepth.runs.results import MODEL, find_result
 
 STUDIES = Path(__file__).parents[1] / "experiments"
-LIMIT_BYTES = 24_500_000
+LIMIT_BYTES = 24_000_000
 """What the studies may take on disk, the bundled models included."""
 
 
