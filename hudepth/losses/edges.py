@@ -40,7 +40,7 @@ def edge_overlap_loss(pred: DepthMap, target: DepthMap, valid: Mask, *, threshol
 
 
 class EdgeOverlap(SingleTermLoss):
-    """:func:`edge_overlap_loss` as a module."""
+    """:func:`edge_overlap_loss` as a module. ConfigError for a threshold that is not positive."""
 
     name = "edges"
 
